@@ -60,55 +60,56 @@ class Answer(Enum):
 class Contact:
     """One pressed area. It keeps its `id` for as long as it is followed from frame to frame."""
 
-    #: The contact's identity: kept while it moves less than 25 mm from frame to frame, and through
-    #: gaps of up to 5 frames. Where two contacts merge, the one nearer to the middle of both lives
-    #: on. An identity that ended is not used again in this session
+    #: The contact's identity, kept while the contact moves less than 25 mm from frame to frame and
+    #: through gaps of up to 5 frames. Where two contacts merge, the contact nearer to the middle of
+    #: both keeps its identity. An identity that ended is not used again in this session
     id: int
-    x_mm: float  #: Its centre, from the skin's middle to the right, seen from the pressed side
-    y_mm: float  #: Its centre, from the skin's middle upwards
-    area_mm2: float  #: Its area
-    magnitude: float | None = None  #: |Δσ|/σ₀ inside it. Unit: ratio.
+    x_mm: float  #: Centre, to the right of the skin's middle, seen from the pressed side
+    y_mm: float  #: Centre, upwards from the skin's middle
+    area_mm2: float  #: Pressed area
+    magnitude: float | None = None  #: |Δσ|/σ₀, mean over the contact's area. Unit: ratio.
     magnitude_sigma: float | None = None  #: Standard uncertainty of `magnitude`. Unit: ratio.
-    #: Pressure on it, a mean over its area; nil when unknown: see `pressure_range`
+    #: Pressure, mean over the contact's area; nil when unknown: see `pressure_range`
     pressure_kpa: float | None = None
-    x_sigma_mm: float | None = None  #: Standard uncertainty of `x_mm`; nil where there is none
-    y_sigma_mm: float | None = None  #: Standard uncertainty of `y_mm`; likewise
-    area_sigma_mm2: float | None = None  #: Standard uncertainty of `area_mm2`; likewise
-    #: Standard uncertainty of `pressure_kpa`: the magnitude's and, where the sensor was calibrated,
-    #: the calibration's. Nil but ``within``
+    x_sigma_mm: float | None = None  #: Standard uncertainty of `x_mm`; nil where unknown
+    y_sigma_mm: float | None = None  #: Standard uncertainty of `y_mm`; nil where unknown
+    area_sigma_mm2: float | None = None  #: Standard uncertainty of `area_mm2`; nil where unknown
+    #: Standard uncertainty of `pressure_kpa`, the calibration's included; nil unless ``within``
     pressure_sigma_kpa: float | None = None
-    #: Pressure times area; or as `taught` by presses of known force. Also in ``below`` and
-    #: ``unknown`` where the sheet answers from no pressure on and the highest is bounded: small and
-    #: hard or large and light, the force is known. A lower bound of 95 % where it is ``above``
+    #: Force: pressure times area, or learnt from presses of known force (`taught`). A lower bound
+    #: (95 %) where ``above``. Known even where ``below`` or ``unknown``, if the response has no
+    #: onset and the highest pressure is bounded: a small hard and a large light press have the same
+    #: force
     force_n: float | None = None
-    #: Standard uncertainty of `force_n`; nil where that is nil or a lower bound, and where the
-    #: area's is not known; or as `taught`
+    #: Standard uncertainty of `force_n`; nil where `force_n` is nil or a lower bound, and where the
+    #: uncertainty of the area is unknown
     force_sigma_n: float | None = None
-    #: ``within``: measured. ``below``: touched, but too lightly for the magnitude channel to
-    #: answer; the pressure is unknown, and `pressure_kpa` nil. ``above``: may be beyond what the
-    #: sensor answers to or was calibrated to (the upper bound of 95 % is); `pressure_kpa` is a
-    #: lower bound of 95 %, at most that range's top, and `max_kpa` nil. ``unknown``: no magnitude
-    #: channel, no response, or too uncertain to tell. Noise alone does not change it: near a border
-    #: a contact stays in the range it was in. Take an absent one for ``unknown``
+    #: ``within``: the pressure is measured. ``below``: the touch is too light for the magnitude
+    #: channel; `pressure_kpa` is nil. ``above``: the upper bound (95 %) exceeds the range of the
+    #: response or calibration; `pressure_kpa` is a lower bound (95 %) and `max_kpa` nil.
+    #: ``unknown``: no magnitude channel, no response, or too uncertain. Noise near a limit does not
+    #: change the range (hysteresis). Treat an absent field as ``unknown``
     pressure_range: str = "unknown"
-    #: Highest pressure under it: above `pressure_kpa` where it is soft. Nil where unknown, a lower
-    #: bound of 95 % where it is ``above``
+    #: Highest pressure under the contact: above `pressure_kpa` where the object is soft. Nil where
+    #: unknown, a lower bound (95 %) where ``above``
     peak_kpa: float | None = None
-    peak_sigma_kpa: float | None = None  #: Standard uncertainty of `peak_kpa`; nil but ``within``
-    #: Upper bound of its highest pressure, 95 %, also where `pressure_range` is ``below`` or
-    #: ``unknown``: what a light touch cannot exceed. Nil where nothing bounds it: no magnitude
-    #: channel, no uncertainty, or ``above``
+    #: Standard uncertainty of `peak_kpa`; nil unless ``within``
+    peak_sigma_kpa: float | None = None
+    #: Upper bound (95 %) of the highest pressure under the contact, also where `pressure_range` is
+    #: ``below`` or ``unknown``. Nil where nothing bounds the pressure: no magnitude channel, no
+    #: uncertainty, or ``above``
     max_kpa: float | None = None
-    #: How the pressure falls to the edge, γ of (1 − ρ²)^γ: 0 flat, 0.5 as Hertz has it; nil where
-    #: unknown
+    #: Profile exponent γ: the pressure falls towards the edge as (1 − ρ²)^γ. 0 is flat, 0.5 is
+    #: Hertzian; nil where unknown
     edge: float | None = None
-    #: Whether presses at known places say where it is (`tactomo teach`): `x_mm`, `y_mm` and their
-    #: uncertainties are then what was learnt, and `force_n` where forces were
+    #: Whether `x_mm`, `y_mm` and their uncertainties come from presses at known places (`tactomo
+    #: teach`); so does `force_n` where the forces were known
     taught: bool = False
-    #: Where it is on the robot: its centre on the sheet's surface, in the frame `frame`. It, the
-    #: normal and the frame are nil where the sensor description has no ``[mount]``
+    #: Centre on the sheet's surface, in the frame `frame`. `position_m`, `normal` and `frame` are
+    #: nil where the sensor description has no ``[mount]``
     position_m: tuple[float, float, float] | None = None
-    #: Unit vector out of the sheet there, in the frame `frame`: what presses pushes against it
+    #: Unit vector out of the sheet at `position_m`, in the frame `frame`: the object pushes against
+    #: the normal
     normal: tuple[float, float, float] | None = None
     frame: str | None = None  #: Name of the robot's link that carries the sheet
 
@@ -151,50 +152,48 @@ def table_row(contact: Contact) -> dict[str, Any]:
 class Envelope:
     """What every message of every kind begins with, after `schema`, `sensor` and `kind`."""
 
-    #: A new random value each time the daemon starts. When it changes, contact ids and `sequence`
-    #: begin anew
+    #: A new random value at each start of the daemon. When `session` changes, contact identities
+    #: and `sequence` begin anew
     session: str
-    #: Rises by one with each message of this kind in this session. A gap means that some were
-    #: missed
+    #: Rises by one with each message of this kind in this session. A gap means missed messages
     sequence: Unsigned
     #: When the dual scan was acquired (see below), on the wall clock of the daemon's computer: UTC
-    #: since 1970. For ``status`` and ``event``, of the newest dual scan; nil before the first
+    #: since 1970. In ``status`` and ``event``: of the newest dual scan, nil before the first
     acquired_realtime_ns: int | None
-    #: The same instant on that computer's ``CLOCK_MONOTONIC``, which nobody sets. Order and
-    #: subtract these; the wall clock jumps
+    #: The same instant on that computer's ``CLOCK_MONOTONIC``, which nobody sets. Compare and
+    #: subtract these times: the wall clock may jump
     acquired_monotonic_ns: int | None
-    #: From then until the daemon had read the dual scan's last byte
+    #: Time from acquisition until the daemon had read the last byte of the dual scan
     delay_ns: int | None = None
-    #: ``device``: by the device's clock, so what buffers hold up is in the age. ``arrival``: that
-    #: clock is not known well enough yet, or is none; what buffers hold up goes unseen
+    #: ``device``: the acquisition time comes from the device's clock, so the age includes delays in
+    #: buffers. ``arrival``: the device has no clock or the daemon does not know the clock yet; the
+    #: age excludes delays in buffers
     dated_by: str | None = None
-    #: Identity of that monotonic clock (on Linux the boot id, ``/proc/sys/kernel/random/boot_id``);
+    #: Identity of the monotonic clock (on Linux the boot id, ``/proc/sys/kernel/random/boot_id``);
     #: may be empty
     clock_id: str = ""
-    #: The same dual scan's time on the device's own clock, 0 to 2^53 − 1: the magnitude scan's,
+    #: Time of the dual scan on the device's clock, 0 to 2^53 − 1: the time of the magnitude scan,
     #: where there is one
     device_us: int | None
-    #: The magnitude scan's time less the structure scan's. Exact where one device took both; nil
-    #: where one is missing, or two devices' clocks are not known well enough yet
+    #: Time of the magnitude scan minus time of the structure scan. Exact where one device took
+    #: both; nil where a scan is missing or the clocks of two devices are not known yet
     skew_ms: float | None = None
-    #: Time from ``acquired`` to publication: the age that the data already had when they left the
-    #: daemon
+    #: Time from acquisition to publication: the age of the data when they left the daemon
     age_ns: int | None
-    #: What made the frame: ``quiet`` (nothing pressed, nothing solved), ``tikhonov``, ``noser``,
-    #: ``fit`` (a few contacts), ``levelset`` (a free form), ``network`` (a trained network alone),
-    #: or another method by its name. Recordings of earlier versions may say ``hybrid``: outlines
-    #: that were fitted, then redrawn by a second network
+    #: The method that made the frame: ``quiet`` (nothing pressed, nothing solved), ``tikhonov``,
+    #: ``noser``, ``fit`` (a few contacts), ``levelset`` (a free form), ``network`` (a trained
+    #: network alone), or another method by its name. Recordings of earlier versions may say
+    #: ``hybrid``: fitted outlines that a second network refined
     tier: str | None
-    tier_reason: str | None  #: Why, in words for people
-    flags: frozenset[str]  #: What to be wary of; see Flags. Empty: nothing
-    #: Rms of what the model left unexplained, in units of the measured noise. About 1 is good;
-    #: above 2 the frame is flagged ``misfit_high``, and above 1.5 over both channels where ``auto``
-    #: has a network stand in. (Not of a ``network`` that is sure, with a `confidence` of 0.9; of a
-    #: linear tier, only above half of what the changes themselves are, too.) Of a ``quiet`` frame
-    #: it is what told so: the changes in units of the noise and of the description's ``stability``
-    #: (0.3 %), which skins reach by themselves; 1.24 (208 voltages) and more is not quiet
+    tier_reason: str | None  #: Why this method, in words for people
+    flags: frozenset[str]  #: Reasons to distrust the frame; see Flags. Empty: none
+    #: Rms of the residual in units of the measured noise. About 1 is good. Above 2 the frame is
+    #: flagged ``misfit_high``, except where ``network`` has a `confidence` of 0.9 or more, or where
+    #: a linear method explains half of the changes. Above 1.5 over both channels, ``auto`` shows
+    #: the network's map. In a ``quiet`` frame: rms of the changes in units of the noise and of the
+    #: description's ``stability`` (0.3 %); a frame is quiet below 1.24 (208 voltages)
     misfit: float | None
-    #: Correlation of the map with the truth that a network expects, 0 to 1; nil where no network
+    #: Correlation with the truth that the network expects of its map, 0 to 1; nil where no network
     #: made the map
     confidence: float | None = None
 
@@ -206,17 +205,18 @@ class Contacts(Envelope):
     sensor: str
     acquired_realtime_ns: int
     acquired_monotonic_ns: int
-    #: The dual scan's counter on the device (32 bits, wraps); the messages of one dual scan share
-    #: it
+    #: The dual scan's counter on the device (32 bits, wraps). All messages of one dual scan have
+    #: the same counter
     scan_counter: int
-    #: What is pressed now. **None means that nothing is pressed**, if the message is not stale and
-    #: all touches are seen (see Stale, or nothing pressed?)
+    #: The pressed areas. **An empty list means "nothing pressed"** only if the message is not stale
+    #: and every touch is seen (see Stale, or nothing pressed?)
     contacts: tuple[Contact, ...]
-    #: Force of all contacts together: 0 where nothing is pressed, nil where one contact's is, a
-    #: lower bound where one is ``above``
+    #: Force of all contacts together: 0 where nothing is pressed, nil where the force of a contact
+    #: is nil, a lower bound where a contact is ``above``
     force_n: float | None = None
-    #: Standard uncertainty of that: less than the contacts' own make where they touch, for the
-    #: errors of one are then another's. Nil where one contact's is, and where nothing is pressed
+    #: Standard uncertainty of `force_n`. Smaller than the root sum of squares where contacts touch:
+    #: their errors cancel. Nil where the uncertainty of a contact's force is nil, and where nothing
+    #: is pressed
     force_sigma_n: float | None = None
 
 
@@ -233,15 +233,15 @@ class Frame(Contacts):
     #: |Δσ|/σ₀ of the magnitude channel at each node; ``map[iy][ix]``, row 0 at the bottom.
     #: Unit: ratio.
     map: Image | None = None
-    #: The same as pressure; nil when the sensor has no magnitude channel or the method gives none.
-    #: **0 only where nothing touches**; NaN where a contact does whose pressure is not known
-    #: (`pressure_range` is ``below`` or ``unknown``); a lower bound where it is ``above``
+    #: Pressure at each node; nil when the sensor has no magnitude channel or the method gives no
+    #: pressure. **0 only where nothing touches**; NaN under a contact whose pressure is unknown
+    #: (``below`` or ``unknown``); a lower bound under a contact that is ``above``
     pressure_kpa: Image | None = None
     structure: Image | None = None  #: How surely each node is pressed, 0 to 1
-    #: Position of the first and the last column. The nodes between are evenly spaced
+    #: Position of the first and the last column. Columns are evenly spaced
     x_mm: tuple[float, float] | Absent = None
     y_mm: tuple[float, float] | Absent = None  #: Position of the first and the last row
-    #: The top of a sensible colour scale for `map`. Unit: ratio.
+    #: Upper end of a sensible colour scale for `map`. Unit: ratio.
     magnitude_max: float | None = None
     _age_at_receipt_ns: int = field(repr=False)
     _received_ns: int | None = field(repr=False)
@@ -297,10 +297,10 @@ class Event(Received):
     sensor: str
     session: str
     sequence: Unsigned
-    name: str  #: See below
+    name: str  #: One of the events below
     severity: str = "info"  #: ``info``, ``warning`` or ``error``
     detail: str = ""  #: What happened, in words
-    next_step: str = ""  #: What to do about it, in words; may be empty
+    next_step: str = ""  #: What to do, in words; may be empty
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,102 +324,109 @@ class Events:
     """All events by name."""
 
     tared = INFO  #: A new reference is in force
-    #: The reference was not taken: scans too uneven (somebody presses), or none came
+    #: The reference was not taken: the scans differ too much (somebody presses), or no scans came
     tare_refused = WARNING
-    #: Something seems to lie on the skin, by the reference kept from before, which is used; or a
-    #: tare was taken while contacts were shown: see the flag of this name
+    #: By the reference kept from before, something seems to lie on the skin: the kept reference
+    #: stays in use. Or a tare was taken while contacts were shown. See the flag of this name
     reference_disputed = WARNING
-    #: At the start neither drift nor contacts explain how the skin differs from the reference kept
-    #: from before: another skin, it seems. The new reference is used
+    #: At the start, neither drift nor contacts explain the difference from the kept reference: the
+    #: skin seems to be another one. The new reference is used
     skin_changed = WARNING
-    #: The skin is at rest by the reference that was kept, or by the one before a disputed tare
+    #: The skin is at rest by the kept reference, or by the reference before a disputed tare
     reference_confirmed = INFO
-    #: The reference cannot be kept for the next start, or the one kept cannot be read
+    #: The reference cannot be written for the next start, or the kept reference cannot be read
     reference_not_kept = EventKind("warning", period_s=600.0)
-    #: What is seen is neither a contact that explains it nor a drift that skins reach, or might be
-    #: either: the reference does not follow it. ``baseline`` in the status says it for as long as
-    #: it lasts
+    #: A change is neither clearly a contact nor clearly drift: the reference does not follow the
+    #: change. ``baseline`` in the status shows this while it lasts
     baseline_refused = EventKind("warning", period_s=600.0)
-    #: One channel's scans stay out; maps go on from the other
+    #: Scans of one channel are missing; maps continue from the other channel
     channel_lost = EventKind("warning", end="channel_back")
-    channel_back = INFO  #: They come again
-    #: One channel's scans repeat bit for bit while their counter goes on, though they had noise at
-    #: the tare: they are left out as missing. One that is frozen all through the first tare cannot
-    #: be told from a source without noise: `tactomo doctor` says that there is no noise at all
+    channel_back = INFO  #: The missing channel sends scans again
+    #: Scans of one channel repeat bit for bit while their counter rises, although they had noise at
+    #: the tare: the daemon treats them as missing. A converter that is frozen during the first tare
+    #: cannot be told from a source without noise; `tactomo doctor` then reports "no noise at all"
     converter_frozen = EventKind("warning", end="converter_back")
-    converter_back = INFO  #: They are measured again
-    #: A port was closed, unplugged, or cannot be opened; it is tried again
+    converter_back = INFO  #: The channel's scans change again
+    #: A port was closed, unplugged, or cannot be opened. The daemon keeps trying
     port_lost = EventKind("error", end="port_back")
-    port_back = INFO  #: It is open again
-    corrupt_packets = FREQUENT  #: Packets on a port were damaged on their way
-    #: Scans of a channel come after those that follow them, and are left out
-    scans_disordered = FREQUENT
-    scans_dropped = FREQUENT  #: Reconstruction lagged and dual scans were left out
-    #: It lagged because others take the processor: frames get half as much time as before
+    port_back = INFO  #: The port is open again
+    corrupt_packets = FREQUENT  #: Packets on a port were damaged in transit
+    scans_disordered = FREQUENT  #: Scans of a channel arrived after later scans and are left out
+    scans_dropped = FREQUENT  #: Reconstruction lagged: dual scans were left out
+    #: Reconstruction lagged because other programs use the processor: each frame gets half as much
+    #: time as before
     processor_shared = EventKind("warning", end="processor_free")
-    processor_free = INFO  #: Frames get all of their time again
-    method_failed = FREQUENT  #: A method of your own failed: the frame is ``tikhonov``'s
-    #: A mistake in tactomo: no frame came of a dual scan
+    processor_free = INFO  #: Each frame gets its full time again
+    method_failed = FREQUENT  #: A method of your own failed: the frame was made by ``tikhonov``
+    #: A defect in tactomo: a dual scan gave no frame
     reconstruction_failed = EventKind("error", period_s=1.0)
     device_restarted = FREQUENT  #: A device was reset: its scan counter and its clock went back
-    #: The scan counter went back, the clock did not: someone asked for it
+    #: The scan counter went back, the clock did not: somebody zeroed the counter
     counters_zeroed = EventKind("info", period_s=1.0)
-    #: A device's clock jumped or went back; scans are dated by arrival until it is known again
+    #: A device's clock jumped or went back. Scans are dated by arrival until the clock is known
+    #: again
     device_clock_jumped = FREQUENT
-    #: A device's clock stands still or runs at an impossible rate; scans are dated by arrival
+    #: A device's clock stands still or runs at an impossible rate. Scans are dated by arrival
     device_clock_unusable = WARNING
-    #: The two channels' counters are out of step: see the flag. Two boards are asked to zero them
+    #: The two channels' counters are out of step: see the flag. The daemon asks two boards to zero
+    #: their counters
     channels_skewed = EventKind("warning", end="channels_in_step")
-    channels_in_step = INFO  #: They are in step again
+    channels_in_step = INFO  #: The two channels' counters are in step again
     #: The computer's clock was set, or the computer slept. Only ``acquired_realtime_ns`` follows it
     wall_clock_jumped = WARNING
     #: A device's scans are not used: ``refusal`` of its port in the status says why
     device_refused = EventKind("error", period_s=1.0, end="device_speaks")
-    #: A pressure calibration or a teaching is there and not used: it is damaged, or of another
-    #: sensor, device or skin
+    #: A pressure calibration or a teaching is not used: the file is damaged, or of another sensor,
+    #: device or skin
     calibration_refused = WARNING
-    #: The pressure calibration and the teaching were read again; what there is, is in force
+    #: The pressure calibration and the teaching were read again and are in force
     calibration_reloaded = INFO
-    #: Another device is at a port than before, and is used. Tare if it has another skin
+    #: A port has another device than before, and the new device is used. Tare if the skin is
+    #: another one
     device_changed = FREQUENT
     #: Nothing came over an open port for 3 s (or three periods of a slower device, or as long as
-    #: its protocol allows). It is asked again; later the port is closed and opened, ever more
-    #: rarely
+    #: its protocol allows). The daemon asks the device again; later the daemon reopens the port,
+    #: ever more rarely
     device_silent = EventKind("warning", period_s=30.0, end="device_speaks")
-    #: Bytes come, but no packet for as long: the wrong baud rate, or no skin
+    #: Bytes came but no packet, for as long: a wrong baud rate, or no skin
     device_garbled = EventKind("warning", period_s=30.0, end="device_speaks")
-    #: A device speaks, but sent no scan for as long, although it was asked to start
+    #: A device sends packets but no scans, for as long, although the daemon asked it to start
     device_idle = EventKind("warning", period_s=30.0, end="device_speaks")
-    device_speaks = INFO  #: It is out of these troubles, or is understood again
-    #: An FTDI adapter holds bytes back for long, and may not be told otherwise
+    device_speaks = INFO  #: The device is no longer silent, garbled, idle or refused
+    #: An FTDI adapter holds bytes back for long, and the daemon may not change that
     latency_timer = WARNING
-    #: A device's packets are intact and break [its protocol](../firmware_protocol/PROTOCOL.md):
-    #: another version, a field out of its range, scans unlike its *hello*. They are not used
+    #: A device's packets are intact but break [the protocol](../firmware_protocol/PROTOCOL.md):
+    #: another version, a field out of range, or scans unlike the *hello*. These packets are not
+    #: used
     firmware_fault = EventKind("warning", period_s=30.0)
-    #: A device speaks, and for 3 s has acknowledged no command
+    #: A device sends packets but has acknowledged no command for 3 s
     command_unanswered = EventKind("warning", period_s=600.0)
-    command_refused = WARNING  #: A device did not carry out a command of the daemon's
+    command_refused = WARNING  #: A device did not carry out a command of the daemon
     recording_started = INFO
     recording_stopped = INFO
-    #: A client whose key is not allowed tried to connect: from where, and its public key
+    #: A client whose key is not allowed tried to connect; the event names its address and public
+    #: key
     client_refused = FREQUENT
-    #: A file in the list of clients holds no key; or others could add to the list, and nobody new
-    #: is let in
+    #: A file in the list of clients holds no key; or other users could write to the list, and
+    #: nobody new is admitted
     client_key_unusable = WARNING
-    #: The disk is full, too slow or gone, or the file was deleted; the stream goes on
+    #: The disk is full, too slow or gone, or the file was deleted. The stream continues
     recording_failed = ERROR
-    recording_resumed = INFO  #: It goes on: there is room again, or the disk answers again
-    #: The disk has not answered for 5 s; what comes waits in memory, up to 64 MiB
+    recording_resumed = INFO  #: The recording continues: the disk has room again, or answers again
+    #: The disk has not answered for 5 s. Data wait in memory, up to 64 MiB
     recording_stalled = WARNING
-    recording_rotated = INFO  #: It goes on in the next file
-    rotation_failed = WARNING  #: The next file cannot be created: it goes on in the present one
-    recording_deleted = INFO  #: An old file, to keep to ``keep_gb`` or ``keep_days``
-    #: A mistake in tactomo: a message would have broken this page; ``sequence`` has the gap
+    recording_rotated = INFO  #: The recording continues in the next file
+    #: The next file cannot be created: the recording continues in the present file
+    rotation_failed = WARNING
+    #: An old recording was deleted to keep within ``keep_gb`` or ``keep_days``
+    recording_deleted = INFO
+    #: A defect in tactomo: a message would have broken this specification and was not sent;
+    #: ``sequence`` has a gap
     message_unsent = EventKind("error", period_s=1.0)
-    connection_cut = FREQUENT  #: A connection sent 2 MB and more that made no message, and was cut
-    #: There were more subscriptions than the daemon keeps (1 MiB), and all connections were cut
-    subscribers_cut = WARNING
-    replay_ended = INFO  #: The recording is at its end
+    #: A connection sent more than 2 MB without a complete message and was cut
+    connection_cut = FREQUENT
+    subscribers_cut = WARNING  #: Subscriptions took more than 1 MiB: all connections were cut
+    replay_ended = INFO  #: The replay has reached the end of the recording
 
 
 EVENTS: Final[Mapping[str, EventKind]] = {
@@ -448,18 +455,20 @@ class Calibration:
     """A pressure calibration: what it rests on, and how good it is."""
 
     taken: str = ""  #: When, ISO 8601, UTC
-    readings: int = 0  #: How many readings of a load cell it rests on
-    #: Between which two pressures it answers; below, a contact is ``below``, beyond, ``above``
+    readings: int = 0  #: Number of load-cell readings that the calibration rests on
+    #: Lowest and highest pressure of the calibration: a contact is ``below`` or ``above`` outside
     range_kpa: tuple[float, ...] = ()
-    #: Its own standard uncertainty: median over the range. A contact's `pressure_sigma_kpa` has it
-    #: in it
+    #: Standard uncertainty of the calibration, median over the range; included in a contact's
+    #: `pressure_sigma_kpa`
     sigma_kpa: float | Absent = None
-    #: From where the channel answers; nil where its lightest reading did already
+    #: Pressure from which the channel responds; nil where the lightest reading already shows a
+    #: response
     onset_kpa: float | None = None
-    #: By how much a falling load reads higher than a rising one; nil where only one of the two was
+    #: How much higher a falling load reads than a rising load; nil where only one of the two was
     #: taken
     hysteresis_kpa: float | None = None
-    #: The devices that it was made with; with others it is not in force. Empty: any
+    #: The devices that were calibrated; with other devices the calibration is not in force. Empty:
+    #: any device
     device_ids: tuple[str, ...] = ()
 
 
@@ -469,8 +478,8 @@ class Taught:
 
     taken: str = ""  #: when, ISO 8601, UTC
     presses: int = 0
-    median_mm: float | Absent = None  #: error of place on presses that were held out
-    untaught_median_mm: float | Absent = None  #: the same of the physics alone
+    median_mm: float | Absent = None  #: median localisation error on held-out presses
+    untaught_median_mm: float | Absent = None  #: the same without teaching
 
 
 @dataclass(frozen=True, slots=True)
@@ -489,28 +498,28 @@ class SensorDescription:
     """The sensor: its sheet, its electrodes and what it answers to."""
 
     model: str = ""  #: The sensor description's name, such as ``paper_square``
-    sha256: str = ""  #: Of the description
-    file: str | None = None  #: Its file on the daemon's computer; nil for a shipped one
+    sha256: str = ""  #: Hash of the description
+    #: The description's file on the daemon's computer; nil for a shipped description
+    file: str | None = None
     shape: str = ""  #: ``rectangle`` or ``disc``
-    width_mm: float | Absent = None  #: Of the sheet's bounding box
-    height_mm: float | Absent = None  #: Likewise
-    sensing_width_mm: float | Absent = None  #: Of the area that can be pressed, centred
-    sensing_height_mm: float | Absent = None  #: Likewise
+    width_mm: float | Absent = None  #: Width of the sheet's bounding box
+    height_mm: float | Absent = None  #: Height of the sheet's bounding box
+    sensing_width_mm: float | Absent = None  #: Width of the area that can be pressed, centred
+    sensing_height_mm: float | Absent = None  #: Height of the area that can be pressed, centred
     #: Centre of each electrode, x and y, electrode 0 first
     electrodes_mm: tuple[tuple[float, float], ...] = ()
-    modalities: tuple[str, ...] = ()  #: The channels it has: ``magnitude``, ``structure``
+    modalities: tuple[str, ...] = ()  #: The sensor's channels: ``magnitude``, ``structure``
     magnitude_max: float | None = None  #: As in ``map``. Unit: ratio.
-    #: The top of the pressure response in force: the calibration's, else the description's
+    #: Highest pressure of the response in force: the calibration's, else the description's
     pressure_max_kpa: float | None = None
-    #: The table by which |Δσ|/σ₀ becomes a pressure (linear between its entries): the
-    #: calibration's, else the description's
+    #: The table that turns |Δσ|/σ₀ into pressure (linear between its entries): the calibration's,
+    #: else the description's
     magnitude_response: MagnitudeResponse | None = None
-    #: The pressure calibration in force, see below; nil where pressures go by the description's
-    #: table, or there is no magnitude channel. It, `pressure_max_kpa` and `magnitude_response` may
+    #: The pressure calibration in force, see below; nil where the description's table is used or
+    #: there is no magnitude channel. `calibration`, `pressure_max_kpa` and `magnitude_response` may
     #: change while the daemon runs
     calibration: Calibration | None = None
-    #: What presses at known places have taught this skin, if that is in force; may change while the
-    #: daemon runs
+    #: The teaching in force (presses at known places); may change while the daemon runs
     taught: Taught | None = None
     #: Where the sheet lies on the robot; nil where the description does not say
     mount: Mount | None = None
@@ -520,9 +529,9 @@ class SensorDescription:
 class Source:
     """Where scans come from."""
 
-    #: ``replay``, of a recording; ``twin``, where the *hello* says that the device is simulated;
-    #: ``device``, any other, an emulator of a foreign protocol included: such protocols cannot say
-    #: so; ``unknown`` before the first *hello*
+    #: ``replay``: a recording; ``twin``: the *hello* says that the device is simulated; ``device``:
+    #: any other, emulators of foreign protocols included, since these protocols cannot say that a
+    #: device is simulated; ``unknown``: before the first *hello*
     kind: str = "unknown"
 
 
@@ -542,12 +551,12 @@ class Device:
 class DeviceClock:
     """How the daemon knows a device's clock."""
 
-    #: ``settling``, ``settled``, ``unusable`` (stands still, or its rate cannot be) or ``absent``
-    #: (the protocol has none)
+    #: ``settling``, ``settled``, ``unusable`` (stands still or runs at an impossible rate) or
+    #: ``absent`` (the protocol has no clock)
     state: str = ""
-    offset_ns: int | None = None  #: the daemon's monotonic clock less the device's
-    rate_ppm: float | None = None  #: by how much the device's clock is slow
-    #: how much later than need be scans come; a bad hub shows here
+    offset_ns: int | None = None  #: the daemon's monotonic clock minus the device's clock
+    rate_ppm: float | None = None  #: how slow the device's clock runs
+    #: delay of scans beyond the smallest delay; a bad hub shows here
     delay_ms: Percentiles | None = None
     jumps: int = 0
 
@@ -557,32 +566,30 @@ class Port:
     """One port that the daemon reads."""
 
     url: str  #: As configured
-    #: What its device speaks: ``tactomo``, or that of other people's hardware
-    protocol: str = "tactomo"
-    connected: bool = False  #: Whether it is open at present
-    #: ``closed`` (tried several times a second), ``starting`` (just opened), ``running``, ``idle``
-    #: (the device speaks, but sends no scans, or none that its *hello* allows: for 3 s, or three of
-    #: its own periods where it is slower), ``faulty`` (likewise, and what comes breaks the
-    #: protocol), ``garbage`` (bytes, but none of the protocol: the wrong baud rate?), ``silent``
-    #: (nothing), ``refused``, or ``ended`` (of a replay)
+    protocol: str = "tactomo"  #: What the device speaks: ``tactomo``, or a foreign protocol
+    connected: bool = False  #: Whether the port is open
+    #: ``closed`` (the daemon tries several times a second), ``starting`` (just opened),
+    #: ``running``, ``idle`` (packets but no valid scans for 3 s, or three periods of a slower
+    #: device), ``faulty`` (as ``idle``, and packets break the protocol), ``garbage`` (bytes but no
+    #: packets: a wrong baud rate?), ``silent`` (no bytes), ``refused``, or ``ended`` (replay)
     state: str = ""
-    problem: str | None = None  #: Why it is closed or of no use, in words
+    problem: str | None = None  #: Why the port is closed or unusable, in words
     device: Device | None = None  #: From the device's *hello*; nil before the first
-    bytes: int = 0  #: Received
-    packets: int = 0  #: Received
-    corrupt: int = 0  #: Packets that were damaged on their way: the line's doing
-    faulty: int = 0  #: Intact packets that break the protocol: the firmware's doing
-    #: By how much `packets`, `corrupt` and `faulty` have risen within it
+    bytes: int = 0  #: Bytes received
+    packets: int = 0  #: Packets received
+    corrupt: int = 0  #: Packets damaged in transit: a fault of the line
+    faulty: int = 0  #: Intact packets that break the protocol: a fault of the firmware
+    #: Increase of `packets`, `corrupt` and `faulty` in the last minute
     received_last_minute: Mapping[str, int] = field(default_factory=dict)
-    #: Why the device's scans are not used, if they are not: it does not fit the description, is
-    #: none of the sensor's ``device_ids``, sends a channel that another port carries, or (of a
-    #: foreign protocol) cannot be understood or refused its configuration
+    #: Why the device's scans are not used; nil where they are used. The device does not fit the
+    #: description, is not in the sensor's ``device_ids``, sends a channel that another port
+    #: carries, or (foreign protocols) cannot be understood or refused its configuration
     refusal: str | None = None
-    #: Scans that were not used: of an unknown or refused device, unlike its *hello*, or of a
+    #: Scans that were not used: from an unknown or refused device, unlike the *hello*, or of a
     #: channel that the sensor does not have
     unused_scans: int = 0
-    reopened: int = 0  #: How often it was closed and opened because the device did not speak
-    #: How long an FTDI adapter holds bytes back at most; nil for any other port
+    reopened: int = 0  #: How often the daemon reopened the port because the device was silent
+    #: Longest time that an FTDI adapter holds bytes back; nil for other ports
     latency_timer_ms: int | None = None
     clock: DeviceClock | Absent = None  #: The device's clock
 
@@ -591,7 +598,7 @@ class Port:
 class Rates:
     """Per second; None for a channel that the sensor does not have."""
 
-    magnitude_hz: float | None = None  #: scans that arrive; nil: the sensor has no such channel
+    magnitude_hz: float | None = None  #: scans that arrive; nil: no such channel
     structure_hz: float | None = None  #: likewise
     frames_hz: float = 0.0  #: frames published
 
@@ -601,26 +608,26 @@ class ScanTally:
     """What became of every single scan since the start."""
 
     received: int = 0
-    used: int = 0  #: in a frame
+    used: int = 0  #: part of a frame
     late: int = 0  #: as in `late_scans`
-    repeated: int = 0  #: had come before
-    dropped: int = 0  #: newer ones had come, or an exact replay does not use them
-    waiting: int = 0  #: for their partner or their turn
+    repeated: int = 0  #: arrived before
+    dropped: int = 0  #: newer scans had come, or an exact replay does not use them
+    waiting: int = 0  #: for the other channel or for processing
 
 
 @dataclass(frozen=True, slots=True)
 class WallClock:
     """Whether the computer's clock was set while the daemon ran."""
 
-    jumps: int = 0  #: how often it was set
-    last_jump_s: float | None = None  #: by how much, the last time
+    jumps: int = 0  #: how often the clock was set
+    last_jump_s: float | None = None  #: the last change
 
 
 @dataclass(frozen=True, slots=True)
 class Reference:
     """The unloaded scans that changes are measured against."""
 
-    scans: int  #: dual scans that it is made of
+    scans: int  #: number of dual scans averaged
     taken_realtime_ns: int  #: when, nanoseconds since 1970 (UTC)
 
 
@@ -637,8 +644,8 @@ class Baseline:
     """How the reference follows the skin's drift."""
 
     #: ``off``, ``waiting`` for a first good frame after a tare, ``following`` while nothing
-    #: presses, ``held`` while something does, ``refused``: what is seen cannot be told from a
-    #: contact, nor from drift
+    #: presses, ``held`` while something presses, ``refused``: a change is neither clearly a contact
+    #: nor clearly drift
     state: str = "off"
     refusal: str | None = None  #: why, in words
     moves: int = 0  #: how often the reference has moved since the tare
@@ -649,12 +656,11 @@ class Baseline:
 class Plan:
     """What frames are given for the method and the budget that were asked for."""
 
-    tier: str = ""  #: the method
-    modelled_ms: float | None = None  #: work, in milliseconds of a 2.5 GHz core
-    #: of the time that was asked for; less than 1 while others take the processor
+    tier: str = ""  #: the method in use
+    modelled_ms: float | None = None  #: expected work, in milliseconds of a 2.5 GHz core
+    #: fraction of the requested time; below 1 while other programs use the processor
     share: float = 1.0
-    #: where the measure between time and work, this machine's speed, comes from, in words
-    source: str = ""
+    source: str = ""  #: origin of the speed estimate of this machine, in words
 
 
 @dataclass(frozen=True, slots=True)
@@ -663,7 +669,7 @@ class Replay:
 
     position_s: float  #: on the recording's own clock, seconds from its beginning
     duration_s: float
-    speed: float  #: factor of the recorded speed; 0: as fast as it is taken
+    speed: float  #: factor of the recorded speed; 0: as fast as possible
     paused: bool = False
     loop: bool = False
     waits_for_page: bool = False  #: paused until a viewer's page is open
@@ -675,18 +681,18 @@ class RecordingProgress:
 
     path: str  #: on the daemon's computer
     bytes: int  #: written
-    queued_bytes: int = 0  #: that wait for the disk
+    queued_bytes: int = 0  #: waiting for the disk
 
 
 @dataclass(frozen=True, slots=True)
 class Recorder:
     """Recordings since the daemon's start."""
 
-    files: int = 0  #: begun
-    deleted: int = 0  #: files, to keep to the rules
+    files: int = 0  #: recordings begun
+    deleted: int = 0  #: recordings deleted to keep within the limits
     failures: int = 0
-    failure: str | None = None  #: why the last recording did not go on, until there is another
-    #: why a recording that is wanted does not run, until it begins again by itself
+    failure: str | None = None  #: why the last recording stopped, until the next recording begins
+    #: why a wanted recording does not run; the recording resumes by itself
     waits_for: str | None = None
 
 
@@ -707,7 +713,7 @@ class EventCounts:
     """What happened since the daemon's start, for those who were not there."""
 
     counts: Mapping[str, int] = field(default_factory=dict)  #: how often, by the event's name
-    #: newest first, at most 8: the last of each event that was no info
+    #: the latest warning or error of each name, newest first, at most 8
     troubles: tuple[Trouble, ...] = ()
 
 
@@ -725,8 +731,8 @@ class Process:
     """What the daemon takes of its computer."""
 
     pid: int
-    cpu_s: float  #: processor time within `uptime_s`
-    memory_bytes: int | None  #: resident
+    cpu_s: float  #: processor time since the start
+    memory_bytes: int | None  #: resident memory
     threads: int
 
 
@@ -750,57 +756,59 @@ class Status(Received):
     tier: str | None = None
     misfit: float | None = None
     version: str = ""  #: The daemon's version
-    #: ``waiting_for_port`` (one is not open yet), ``waiting_for_data``, ``taring``, ``running``,
-    #: ``late`` (scans come, and the newest frame is as old as if none did: reconstruction lags),
-    #: ``stale`` (there were data, none come: for 1 s, or three periods of what is slower), or, of a
-    #: replay, ``paused`` or ``ended``
+    #: ``waiting_for_port`` (a port is not open yet), ``waiting_for_data``, ``taring``, ``running``,
+    #: ``late`` (scans arrive, but reconstruction lags by more than a stale sensor's limit),
+    #: ``stale`` (no data for 1 s, or three periods of a slower device); of a replay also ``paused``
+    #: or ``ended``
     state: str = ""
-    #: All that the daemon finds wrong at present, errors first; empty where all is well. Whoever
-    #: shows how a sensor is prints these, and judges nothing but whether messages come
+    #: Everything that is wrong at present, errors first; empty where all is well. A program that
+    #: shows a sensor's health prints these issues and judges for itself only whether messages
+    #: arrive
     issues: tuple[HealthIssue, ...] = ()
-    uptime_s: float = 0.0  #: Since the daemon's start
-    control: str = ""  #: Address of the control socket, as it is bound on the daemon's computer
+    uptime_s: float = 0.0  #: Time since the daemon's start
+    control: str = ""  #: Address of the control socket on the daemon's computer
     description: SensorDescription | Absent = None  #: The sensor, see below
-    source: Source = field(default_factory=Source)  #: Where scans come from
-    replay: Replay | None = None  #: Of a replay; nil where the ports are live
+    source: Source = field(default_factory=Source)  #: Origin of the scans
+    replay: Replay | None = None  #: Progress of a replay; nil where the ports are live
     ports: tuple[Port, ...] = ()  #: One for each port, see below
     rates: Rates = field(default_factory=Rates)  #: Per second
-    dropped_scans: int = 0  #: Dual scans left out because newer ones had come
-    #: Dual scans of which one channel did not come; one that has not come yet at all counts when it
-    #: has not for 3 s
+    dropped_scans: int = 0  #: Dual scans left out because newer dual scans had come
+    #: Dual scans without a scan of one channel. A channel that has sent nothing yet counts after 3
+    #: s
     incomplete_scans: int = 0
-    #: By how much `frames`, `dropped_scans` and `incomplete_scans` have risen within it: what was
-    #: long ago is over
+    #: Increase of `frames`, `dropped_scans` and `incomplete_scans` in the last minute
     last_minute: Mapping[str, int] = field(default_factory=dict)
-    #: Scans that came after their dual scan had gone on without them, and were left out
+    #: Scans left out because they arrived after their dual scan had been processed
     late_scans: int = 0
-    #: What became of every single scan since the start. Each is counted, so they add up but for the
-    #: few scans that change places while they are read
+    #: What became of each scan since the start. The counts add up, except for the few scans in
+    #: transit while they are read
     scan_tally: ScanTally = field(default_factory=ScanTally)
-    channel_skew_ms: Percentiles | None = None  #: The size of `skew_ms`
+    channel_skew_ms: Percentiles | None = None  #: Absolute value of `skew_ms`
     #: Whether the computer's clock was set while the daemon ran
     wall_clock: WallClock = field(default_factory=WallClock)
-    reference: Reference | None = None  #: What changes are measured against; nil before a tare
+    #: The scans that changes are measured against; nil before a tare
+    reference: Reference | None = None
     #: How the reference follows the skin's drift
     baseline: Baseline = field(default_factory=Baseline)
-    #: For each stage of the pipeline
+    #: Processing time of each stage of the pipeline
     stage_ms: Mapping[str, Percentiles] = field(default_factory=dict)
-    latency_ms: Percentiles | None = None  #: From the last byte read to publication
-    #: The methods that ``set_tier`` takes: ``auto``, those of tactomo, and others that were
-    #: installed or named at the daemon's start
+    latency_ms: Percentiles | None = None  #: Time from the last byte read to publication
+    #: The methods that ``set_tier`` takes: ``auto``, tactomo's own, and methods installed or named
+    #: at the daemon's start
     methods: tuple[str, ...] = ()
-    tier_requested: str = ""  #: The method that was asked for, one of `methods`
-    budget_ms: float | None = None  #: Time that a frame may take; nil: the method's own
-    plan: Plan = field(default_factory=Plan)  #: What frames are given for these two
+    tier_requested: str = ""  #: The requested method, one of `methods`
+    budget_ms: float | None = None  #: Requested time per frame; nil: the method's own
+    #: Method and work in force, from `tier_requested` and `budget_ms`
+    plan: Plan = field(default_factory=Plan)
     recording: RecordingProgress | None = None  #: Nil when nothing is recorded
-    recorder: Recorder = field(default_factory=Recorder)  #: Since the start
-    subscribers: int = 0  #: Subscriptions in force
-    #: Scans that came since the start, by the name of each channel that the sensor has
+    recorder: Recorder = field(default_factory=Recorder)  #: Recordings since the start
+    subscribers: int = 0  #: Number of subscriptions
+    #: Scans received since the start, by channel
     scans: Mapping[str, int] = field(default_factory=dict)
     frames: int = 0  #: Frames published since the start
-    #: What happened since the start, for those who were not there
+    #: What happened since the start, for programs that connected later
     events: EventCounts = field(default_factory=EventCounts)
-    process: Process | Absent = None  #: What the daemon takes of its computer
+    process: Process | Absent = None  #: The daemon's use of its computer
 
 
 @dataclass(frozen=True, slots=True)

@@ -112,7 +112,7 @@ def test_every_state_is_listed_and_scraped() -> None:
 
 
 def test_every_method_is_listed_that_may_have_made_a_frame() -> None:
-    row = re.search(r"^\| `tier` \|.*?What made the frame: (.*)\|", DOCUMENT, re.M)
+    row = re.search(r"^\| `tier` \|.*?The method that made the frame: (.*)\|", DOCUMENT, re.M)
     assert row
     listed = set(re.findall(r"`(\S+)`", row[1]))
     old = {"hybrid"}
@@ -123,8 +123,8 @@ def test_every_method_is_listed_that_may_have_made_a_frame() -> None:
 def test_it_says_from_what_misfit_on_a_frame_is_flagged() -> None:
     row = re.search(r"^\| `misfit` .*", DOCUMENT, re.M)
     assert row
-    assert f"above {BAD_MISFIT:g} the frame" in row[0]
-    assert f"above {UNSURE_MISFIT:g} over both" in row[0]
+    assert f"Above {BAD_MISFIT:g} the frame" in row[0]
+    assert f"Above {UNSURE_MISFIT:g} over both" in row[0]
 
 
 def test_every_event_is_listed_and_told() -> None:

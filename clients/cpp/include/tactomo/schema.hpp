@@ -24,141 +24,140 @@ inline constexpr std::array<std::string_view, 4> pressure_ranges{
 struct Contact;
 
 struct ContactFields {
-    /// The contact's identity: kept while it moves less than 25 mm from frame to frame, and through
-    /// gaps of up to 5 frames. Where two contacts merge, the one nearer to the middle of both lives
-    /// on. An identity that ended is not used again in this session.
+    /// The contact's identity, kept while the contact moves less than 25 mm from frame to frame and
+    /// through gaps of up to 5 frames. Where two contacts merge, the contact nearer to the middle
+    /// of both keeps its identity. An identity that ended is not used again in this session.
     std::int64_t id = 0;
-    /// Its centre, from the skin's middle to the right, seen from the pressed side.
+    /// Centre, to the right of the skin's middle, seen from the pressed side.
     double x_mm = 0;
-    /// Its centre, from the skin's middle upwards.
+    /// Centre, upwards from the skin's middle.
     double y_mm = 0;
-    /// Its area.
+    /// Pressed area.
     double area_mm2 = 0;
-    /// |Δσ|/σ₀ inside it. Unit: ratio.
+    /// |Δσ|/σ₀, mean over the contact's area. Unit: ratio.
     std::optional<double> magnitude;
     /// Standard uncertainty of `magnitude`. Unit: ratio.
     std::optional<double> magnitude_sigma;
-    /// Pressure on it, a mean over its area; nil when unknown: see `pressure_range`.
+    /// Pressure, mean over the contact's area; nil when unknown: see `pressure_range`.
     std::optional<double> pressure_kpa;
-    /// Standard uncertainty of `x_mm`; nil where there is none.
+    /// Standard uncertainty of `x_mm`; nil where unknown.
     std::optional<double> x_sigma_mm;
-    /// Standard uncertainty of `y_mm`; likewise.
+    /// Standard uncertainty of `y_mm`; nil where unknown.
     std::optional<double> y_sigma_mm;
-    /// Standard uncertainty of `area_mm2`; likewise.
+    /// Standard uncertainty of `area_mm2`; nil where unknown.
     std::optional<double> area_sigma_mm2;
-    /// Standard uncertainty of `pressure_kpa`: the magnitude's and, where the sensor was
-    /// calibrated, the calibration's. Nil but `within`.
+    /// Standard uncertainty of `pressure_kpa`, the calibration's included; nil unless `within`.
     std::optional<double> pressure_sigma_kpa;
-    /// Pressure times area; or as `taught` by presses of known force. Also in `below` and `unknown`
-    /// where the sheet answers from no pressure on and the highest is bounded: small and hard or
-    /// large and light, the force is known. A lower bound of 95 % where it is `above`.
+    /// Force: pressure times area, or learnt from presses of known force (`taught`). A lower bound
+    /// (95 %) where `above`. Known even where `below` or `unknown`, if the response has no onset
+    /// and the highest pressure is bounded: a small hard and a large light press have the same
+    /// force.
     std::optional<double> force_n;
-    /// Standard uncertainty of `force_n`; nil where that is nil or a lower bound, and where the
-    /// area's is not known; or as `taught`.
+    /// Standard uncertainty of `force_n`; nil where `force_n` is nil or a lower bound, and where
+    /// the uncertainty of the area is unknown.
     std::optional<double> force_sigma_n;
-    /// `within`: measured. `below`: touched, but too lightly for the magnitude channel to answer;
-    /// the pressure is unknown, and `pressure_kpa` nil. `above`: may be beyond what the sensor
-    /// answers to or was calibrated to (the upper bound of 95 % is); `pressure_kpa` is a lower
-    /// bound of 95 %, at most that range's top, and `max_kpa` nil. `unknown`: no magnitude channel,
-    /// no response, or too uncertain to tell. Noise alone does not change it: near a border a
-    /// contact stays in the range it was in. Take an absent one for `unknown`.
+    /// `within`: the pressure is measured. `below`: the touch is too light for the magnitude
+    /// channel; `pressure_kpa` is nil. `above`: the upper bound (95 %) exceeds the range of the
+    /// response or calibration; `pressure_kpa` is a lower bound (95 %) and `max_kpa` nil.
+    /// `unknown`: no magnitude channel, no response, or too uncertain. Noise near a limit does not
+    /// change the range (hysteresis). Treat an absent field as `unknown`.
     PressureRange pressure_range = PressureRange::unknown;
-    /// Highest pressure under it: above `pressure_kpa` where it is soft. Nil where unknown, a lower
-    /// bound of 95 % where it is `above`.
+    /// Highest pressure under the contact: above `pressure_kpa` where the object is soft. Nil where
+    /// unknown, a lower bound (95 %) where `above`.
     std::optional<double> peak_kpa;
-    /// Standard uncertainty of `peak_kpa`; nil but `within`.
+    /// Standard uncertainty of `peak_kpa`; nil unless `within`.
     std::optional<double> peak_sigma_kpa;
-    /// Upper bound of its highest pressure, 95 %, also where `pressure_range` is `below` or
-    /// `unknown`: what a light touch cannot exceed. Nil where nothing bounds it: no magnitude
-    /// channel, no uncertainty, or `above`.
+    /// Upper bound (95 %) of the highest pressure under the contact, also where `pressure_range` is
+    /// `below` or `unknown`. Nil where nothing bounds the pressure: no magnitude channel, no
+    /// uncertainty, or `above`.
     std::optional<double> max_kpa;
-    /// How the pressure falls to the edge, γ of (1 − ρ²)^γ: 0 flat, 0.5 as Hertz has it; nil where
-    /// unknown.
+    /// Profile exponent γ: the pressure falls towards the edge as (1 − ρ²)^γ. 0 is flat, 0.5 is
+    /// Hertzian; nil where unknown.
     std::optional<double> edge;
-    /// Whether presses at known places say where it is (`tactomo teach`): `x_mm`, `y_mm` and their
-    /// uncertainties are then what was learnt, and `force_n` where forces were.
+    /// Whether `x_mm`, `y_mm` and their uncertainties come from presses at known places (`tactomo
+    /// teach`); so does `force_n` where the forces were known.
     bool taught = false;
-    /// Where it is on the robot: its centre on the sheet's surface, in the frame `frame`. It, the
-    /// normal and the frame are nil where the sensor description has no `[mount]`.
+    /// Centre on the sheet's surface, in the frame `frame`. `position_m`, `normal` and `frame` are
+    /// nil where the sensor description has no `[mount]`.
     std::optional<std::array<double, 3>> position_m;
-    /// Unit vector out of the sheet there, in the frame `frame`: what presses pushes against it.
+    /// Unit vector out of the sheet at `position_m`, in the frame `frame`: the object pushes
+    /// against the normal.
     std::optional<std::array<double, 3>> normal;
     /// Name of the robot's link that carries the sheet.
     Text<63> frame;
 };
 
 struct FrameFields {
-    /// A new random value each time the daemon starts. When it changes, contact ids and `sequence`
-    /// begin anew.
+    /// A new random value at each start of the daemon. When `session` changes, contact identities
+    /// and `sequence` begin anew.
     Text<64> session;
-    /// Rises by one with each message of this kind in this session. A gap means that some were
-    /// missed.
+    /// Rises by one with each message of this kind in this session. A gap means missed messages.
     std::uint64_t sequence = 0;
     std::int64_t acquired_realtime_ns = 0;
     std::int64_t acquired_monotonic_ns = 0;
-    /// From then until the daemon had read the dual scan's last byte.
+    /// Time from acquisition until the daemon had read the last byte of the dual scan.
     std::optional<std::int64_t> delay_ns;
-    /// `device`: by the device's clock, so what buffers hold up is in the age. `arrival`: that
-    /// clock is not known well enough yet, or is none; what buffers hold up goes unseen.
+    /// `device`: the acquisition time comes from the device's clock, so the age includes delays in
+    /// buffers. `arrival`: the device has no clock or the daemon does not know the clock yet; the
+    /// age excludes delays in buffers.
     Text<48> dated_by;
-    /// Identity of that monotonic clock (on Linux the boot id, `/proc/sys/kernel/random/boot_id`);
+    /// Identity of the monotonic clock (on Linux the boot id, `/proc/sys/kernel/random/boot_id`);
     /// may be empty.
     Text<64> clock_id;
-    /// The same dual scan's time on the device's own clock, 0 to 2^53 − 1: the magnitude scan's,
+    /// Time of the dual scan on the device's clock, 0 to 2^53 − 1: the time of the magnitude scan,
     /// where there is one.
     std::optional<std::int64_t> device_us;
-    /// The magnitude scan's time less the structure scan's. Exact where one device took both; nil
-    /// where one is missing, or two devices' clocks are not known well enough yet.
+    /// Time of the magnitude scan minus time of the structure scan. Exact where one device took
+    /// both; nil where a scan is missing or the clocks of two devices are not known yet.
     std::optional<double> skew_ms;
-    /// Time from `acquired` to publication: the age that the data already had when they left the
-    /// daemon.
+    /// Time from acquisition to publication: the age of the data when they left the daemon.
     std::optional<std::int64_t> age_ns;
-    /// What made the frame: `quiet` (nothing pressed, nothing solved), `tikhonov`, `noser`, `fit`
-    /// (a few contacts), `levelset` (a free form), `network` (a trained network alone), or another
-    /// method by its name. Recordings of earlier versions may say `hybrid`: outlines that were
-    /// fitted, then redrawn by a second network.
+    /// The method that made the frame: `quiet` (nothing pressed, nothing solved), `tikhonov`,
+    /// `noser`, `fit` (a few contacts), `levelset` (a free form), `network` (a trained network
+    /// alone), or another method by its name. Recordings of earlier versions may say `hybrid`:
+    /// fitted outlines that a second network refined.
     Text<48> tier;
-    /// Why, in words for people.
+    /// Why this method, in words for people.
     Text<255> tier_reason;
-    /// What to be wary of; see Flags. Empty: nothing.
+    /// Reasons to distrust the frame; see Flags. Empty: none.
     std::vector<Text<48>> flags;
-    /// Rms of what the model left unexplained, in units of the measured noise. About 1 is good;
-    /// above 2 the frame is flagged `misfit_high`, and above 1.5 over both channels where `auto`
-    /// has a network stand in. (Not of a `network` that is sure, with a `confidence` of 0.9; of a
-    /// linear tier, only above half of what the changes themselves are, too.) Of a `quiet` frame it
-    /// is what told so: the changes in units of the noise and of the description's `stability` (0.3
-    /// %), which skins reach by themselves; 1.24 (208 voltages) and more is not quiet.
+    /// Rms of the residual in units of the measured noise. About 1 is good. Above 2 the frame is
+    /// flagged `misfit_high`, except where `network` has a `confidence` of 0.9 or more, or where a
+    /// linear method explains half of the changes. Above 1.5 over both channels, `auto` shows the
+    /// network's map. In a `quiet` frame: rms of the changes in units of the noise and of the
+    /// description's `stability` (0.3 %); a frame is quiet below 1.24 (208 voltages).
     std::optional<double> misfit;
-    /// Correlation of the map with the truth that a network expects, 0 to 1; nil where no network
+    /// Correlation with the truth that the network expects of its map, 0 to 1; nil where no network
     /// made the map.
     std::optional<double> confidence;
     Text<64> sensor;
-    /// The dual scan's counter on the device (32 bits, wraps); the messages of one dual scan share
-    /// it.
+    /// The dual scan's counter on the device (32 bits, wraps). All messages of one dual scan have
+    /// the same counter.
     std::int64_t scan_counter = 0;
-    /// What is pressed now. **None means that nothing is pressed**, if the message is not stale and
-    /// all touches are seen (see Stale, or nothing pressed?).
+    /// The pressed areas. **An empty list means "nothing pressed"** only if the message is not
+    /// stale and every touch is seen (see Stale, or nothing pressed?).
     std::vector<Contact> contacts;
-    /// Force of all contacts together: 0 where nothing is pressed, nil where one contact's is, a
-    /// lower bound where one is `above`.
+    /// Force of all contacts together: 0 where nothing is pressed, nil where the force of a contact
+    /// is nil, a lower bound where a contact is `above`.
     std::optional<double> force_n;
-    /// Standard uncertainty of that: less than the contacts' own make where they touch, for the
-    /// errors of one are then another's. Nil where one contact's is, and where nothing is pressed.
+    /// Standard uncertainty of `force_n`. Smaller than the root sum of squares where contacts
+    /// touch: their errors cancel. Nil where the uncertainty of a contact's force is nil, and where
+    /// nothing is pressed.
     std::optional<double> force_sigma_n;
     /// |Δσ|/σ₀ of the magnitude channel at each node; `map[iy][ix]`, row 0 at the bottom. Unit:
     /// ratio.
     Image map;
-    /// The same as pressure; nil when the sensor has no magnitude channel or the method gives none.
-    /// **0 only where nothing touches**; NaN where a contact does whose pressure is not known
-    /// (`pressure_range` is `below` or `unknown`); a lower bound where it is `above`.
+    /// Pressure at each node; nil when the sensor has no magnitude channel or the method gives no
+    /// pressure. **0 only where nothing touches**; NaN under a contact whose pressure is unknown
+    /// (`below` or `unknown`); a lower bound under a contact that is `above`.
     Image pressure_kpa;
     /// How surely each node is pressed, 0 to 1.
     Image structure;
-    /// Position of the first and the last column. The nodes between are evenly spaced.
+    /// Position of the first and the last column. Columns are evenly spaced.
     std::array<double, 2> x_mm{};
     /// Position of the first and the last row.
     std::array<double, 2> y_mm{};
-    /// The top of a sensible colour scale for `map`. Unit: ratio.
+    /// Upper end of a sensible colour scale for `map`. Unit: ratio.
     std::optional<double> magnitude_max;
 };
 
