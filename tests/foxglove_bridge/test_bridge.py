@@ -21,16 +21,17 @@ import pytest
 from foxglove_client import PROTOCOL, FoxgloveClient
 from recorded_grasp import contacts_of, images_of
 from tactomo.imaging.frames import description_fields
-from tactomo_client import MessageError
+from tactomo_client import Contact, MessageError
 from tactomo_client.fake import FakeSensor
 from tactomo_client.messages import encode_message
 from tactomo_foxglove import Bridge, BridgeError, Placement
 from tactomo_models import load_description
+from variants import variant
 from waiting import PATIENCE_S
 
 PRESSED = 50
 DESCRIPTION = description_fields(load_description("paper_square"))
-ALL = {"sheet", "contacts", "grid", "image", "annotations", "frame", "health", "events"}
+ALL = {"sheet", "contacts", "surface", "grid", "image", "annotations", "frame", "health", "events"}
 STATUS: Mapping[str, Any] = {
     "issues": [{"severity": "error", "what": "it hums", "next_step": "oil it"}],
     "state": "running",
@@ -151,6 +152,50 @@ def test_contacts_are_discs_as_high_as_the_pressure(client: FoxgloveClient) -> N
     assert "touched, pressure unknown" in words_of(scene)
     assert scene.deletions[0].type == 1  # all that were there before
     assert {e.frame_id for e in scene.entities} == {"left"}
+
+
+def test_a_mounted_sheet_is_drawn_on_its_surface(sensor: FakeSensor) -> None:
+    mount = {"frame": "arm", "cylinder": {"radius_m": 0.05}}
+    sheet = description_fields(variant(load_description("paper_square"), mount=mount))
+    status = {**STATUS, "description": sheet}
+    up: dict[str, Any] = {"position_m": (0.05, 0.0, 0.01), "normal": (1.0, 0.0, 0.0)}
+    contact = Contact(1, 0.0, 10.0, 700.0, 0.1, 0.01, 170.0, force_n=8.0, frame="arm", **up)
+    stop = threading.Event()
+
+    def say() -> None:
+        image = np.zeros((51, 51), np.float32)
+        while not stop.wait(0.05):
+            sensor.publish_message("status", status)
+            sensor.publish([contact], map=image, structure=image)
+
+    thread = threading.Thread(target=say)
+    with bridged(sensor.address) as bridge, FoxgloveClient(bridge.url) as client:
+        sensor.wait_for_subscriber()
+        thread.start()
+        try:
+            tf = client.wait("/tf", lambda tf: tf.transforms[0].child_frame_id == "arm")
+            scene = client.wait("/left/contacts", lambda scene: bool(scene.entities))
+            surface = client.wait("/left/surface", lambda _: True)
+            drawn = client.wait("/left/sheet", lambda _: True)
+        finally:
+            stop.set()
+            thread.join()
+    (entity,) = scene.entities
+    arrow, disc = entity.arrows[0].pose, entity.cylinders[0]
+    assert entity.frame_id == "arm"
+    assert arrow.position.x > 0.06
+    assert arrow.position.z == pytest.approx(0.01)
+    q = arrow.orientation
+    along = (1 - 2 * (q.y**2 + q.z**2), 2 * (q.x * q.y + q.z * q.w), 2 * (q.x * q.z - q.y * q.w))
+    assert along == pytest.approx((-1, 0, 0), abs=1e-9)  # into the sheet
+    assert disc.pose.position.x - disc.size.z / 2 == pytest.approx(0.05)
+    (triangles,) = surface.entities[0].triangles
+    assert len(triangles.indices) == 50 * 50 * 6
+    outline = drawn.entities[0].lines[0].points
+    for point in (*triangles.points, *outline):
+        assert np.hypot(point.x, point.y) == pytest.approx(0.05, rel=0.01)
+    assert drawn.entities[0].frame_id == "arm"
+    assert tf.transforms[0].parent_frame_id == "world"
 
 
 def test_the_grid_has_the_numbers_and_lies_where_the_map_is(client: FoxgloveClient) -> None:

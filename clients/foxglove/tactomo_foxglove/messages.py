@@ -1,7 +1,8 @@
 """A frame, a sensor, an event as Foxglove's messages: what is drawn, and the numbers to plot.
 
 Lengths are in metres here, as Foxglove wants them. Everything is in the sensor's own frame, named
-as the sensor: origin at the sheet's centre, x to the right, y up, z out of the pressed side.
+as the sensor: origin at the sheet's centre, x to the right, y up, z out of the pressed side. Where
+the sensor's description has a mount, everything is in the link's frame, on the sheet's surface.
 """
 
 from __future__ import annotations
@@ -42,15 +43,20 @@ def to_timestamp(time_ns: int) -> fox.Timestamp:
     return fox.Timestamp(*divmod(time_ns, 1_000_000_000))
 
 
-def transforms(sensor: str, placement: Placement, time_ns: int) -> fox.FrameTransforms:
-    """Return where the sensor hangs."""
+def frame_of(sensor: str, description: Mapping[str, Any]) -> str:
+    """Return the frame that the sensor is drawn in: its own, or that of the link it is on."""
+    return str((description.get("mount") or {"frame": sensor})["frame"])
+
+
+def transforms(child: str, placement: Placement, time_ns: int) -> fox.FrameTransforms:
+    """Return where the sensor hangs, or the link that carries it."""
     x, y, z, w = placement.quaternion
     return fox.FrameTransforms(
         transforms=[
             fox.FrameTransform(
                 timestamp=to_timestamp(time_ns),
                 parent_frame_id=placement.parent,
-                child_frame_id=sensor,
+                child_frame_id=child,
                 translation=fox.Vector3(x=placement.x_m, y=placement.y_m, z=placement.z_m),
                 rotation=fox.Quaternion(x=x, y=y, z=z, w=w),
             )
@@ -62,8 +68,11 @@ def grid(frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str)
     """Return the map as a grid: its colours, and the numbers behind them as fields of their own.
 
     The fields are `pressure_kpa`, `magnitude` (|Δσ|/σ₀) and `structure`, as far as the frame has
-    them; NaN where there is no value. None for a frame without images.
+    them; NaN where there is no value. None for a frame without images, and for a sheet on a
+    surface, which `surface` draws.
     """
+    if description.get("mount"):
+        return None
     pixels, shown = (
         appearance.map_pixels(frame, description),
         appearance.shown_image(frame, description),
@@ -98,6 +107,40 @@ def grid(frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str)
         fields=_fields(cells.dtype),
         data=cells.tobytes(),
     )
+
+
+def surface(
+    frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str
+) -> fox.SceneUpdate | None:
+    """Return the map on the surface that carries the sheet; None for a flat one, or no images."""
+    mount = description.get("mount")
+    pixels = appearance.map_pixels(frame, description)
+    shown = appearance.shown_image(frame, description)
+    if not mount or pixels is None or shown is None:
+        return None
+    rows, columns, _ = pixels.shape
+    known = appearance.known_nodes(frame, shown[0])
+    node = np.arange(rows * columns).reshape(rows, columns)
+    left, right = node[:-1, :-1], node[:-1, 1:]
+    below = np.stack([left, right, right + columns], axis=-1)
+    above = np.stack([left, right + columns, left + columns], axis=-1)
+    corners = np.concatenate([below.reshape(-1, 3), above.reshape(-1, 3)])
+    corners = corners[known.ravel()[corners].all(axis=1)]
+    points = appearance.surface_nodes(mount["surface_m"], (rows, columns)).reshape(-1, 3)
+    colours = _faded(pixels, stale).reshape(-1, 3) / 255
+    triangles = fox.TriangleListPrimitive(
+        pose=fox.Pose(position=fox.Vector3(), orientation=_UPRIGHT),
+        points=[fox.Point3(x=x, y=y, z=z) for x, y, z in points.tolist()],
+        colors=[fox.Color(r=r, g=g, b=b, a=1.0) for r, g, b in colours.tolist()],
+        indices=corners.ravel().tolist(),
+    )
+    entity = fox.SceneEntity(
+        timestamp=to_timestamp(time_ns),
+        frame_id=str(mount["frame"]),
+        id="map",
+        triangles=[triangles],
+    )
+    return fox.SceneUpdate(entities=[entity])
 
 
 def _fields(cells: np.dtype[Any]) -> list[fox.PackedElementField]:
@@ -174,20 +217,28 @@ def contacts_scene(
     entities = [
         fox.SceneEntity(
             timestamp=at,
-            frame_id=frame.sensor,
+            frame_id=contact.frame or frame.sensor,
             id=f"contact {contact.id}",
             metadata=_metadata(contact),
             cylinders=[_disc(contact, description, stale)],
+            arrows=_force_arrow(contact, description, stale),
             texts=[_floating_label(contact, description, stale)],
         )
         for contact in frame.contacts
     ]
     if stale:
-        above = _pose(0.0, 0.6 * float(description.get("height_mm") or 150.0), 0.02)
+        height_mm = float(description.get("height_mm") or 150.0)
+        (point,) = _points(description, np.array([(0.0, 0.6 * height_mm)])).tolist()
+        above = _at(point[0], point[1], point[2] + 0.02)
         red = fox.Color(r=1.0, g=0.35, b=0.3, a=1.0)
         words = _text(stale.replace("; ", "\n"), above, red, 16.0)
         entities.append(
-            fox.SceneEntity(timestamp=at, frame_id=frame.sensor, id="stale", texts=[words])
+            fox.SceneEntity(
+                timestamp=at,
+                frame_id=frame_of(frame.sensor, description),
+                id="stale",
+                texts=[words],
+            )
         )
     return fox.SceneUpdate(deletions=[everything], entities=entities)
 
@@ -196,7 +247,7 @@ def _disc(contact: Contact, description: Mapping[str, Any], stale: str) -> fox.C
     diameter_m = contact_diameter_mm(contact) * 1e-3
     height_m = disc_height_m(contact, description)
     return fox.CylinderPrimitive(
-        pose=_pose(contact.x_mm, contact.y_mm, height_m / 2),
+        pose=_above(contact, height_m / 2),
         size=fox.Vector3(x=diameter_m, y=diameter_m, z=height_m),
         bottom_scale=1.0,
         top_scale=1.0,
@@ -207,12 +258,57 @@ def _disc(contact: Contact, description: Mapping[str, Any], stale: str) -> fox.C
 def _floating_label(
     contact: Contact, description: Mapping[str, Any], stale: str
 ) -> fox.TextPrimitive:
-    above = _pose(contact.x_mm, contact.y_mm, disc_height_m(contact, description) + 0.006)
+    above = _above(contact, disc_height_m(contact, description) + 0.006)
     return _text(label(contact), above, GREY if stale else WHITE, 12.0)
 
 
-def _pose(x_mm: float, y_mm: float, z_m: float) -> fox.Pose:
-    return fox.Pose(position=fox.Vector3(x=x_mm * 1e-3, y=y_mm * 1e-3, z=z_m), orientation=_UPRIGHT)
+def _force_arrow(
+    contact: Contact, description: Mapping[str, Any], stale: str
+) -> list[fox.ArrowPrimitive]:
+    """Return the force on a mounted sheet: from outside to the contact, as long as it is high."""
+    if contact.normal is None or contact.force_n is None:
+        return []
+    length_m = 2 * disc_height_m(contact, description) + 0.01
+    inwards = [-part for part in contact.normal]
+    # An arrow lies along x: from z to x is a quarter turn about y.
+    x, y, z, w = appearance.towards(inwards)
+    half = math.sqrt(0.5)
+    turned = fox.Quaternion(x=half * (x + z), y=half * (y - w), z=half * (z - x), w=half * (w + y))
+    return [
+        fox.ArrowPrimitive(
+            pose=_above(contact, length_m, turned),
+            shaft_length=0.7 * length_m,
+            shaft_diameter=0.002,
+            head_length=0.3 * length_m,
+            head_diameter=0.005,
+            color=GREY if stale else WHITE,
+        )
+    ]
+
+
+def _above(contact: Contact, height_m: float, turned: fox.Quaternion | None = None) -> fox.Pose:
+    """Return the pose of what is at a height above a contact; it stands there if not `turned`."""
+    if contact.position_m is None or contact.normal is None:
+        return _at(contact.x_mm * 1e-3, contact.y_mm * 1e-3, height_m)
+    place = [p + height_m * n for p, n in zip(contact.position_m, contact.normal, strict=True)]
+    x, y, z, w = appearance.towards(contact.normal)
+    return fox.Pose(
+        position=fox.Vector3(x=place[0], y=place[1], z=place[2]),
+        orientation=turned or fox.Quaternion(x=x, y=y, z=z, w=w),
+    )
+
+
+def _at(x: float, y: float, z: float) -> fox.Pose:
+    return fox.Pose(position=fox.Vector3(x=x, y=y, z=z), orientation=_UPRIGHT)
+
+
+def _points(description: Mapping[str, Any], xy_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return where places (N, 2) of the sheet are, (N, 3) in metres."""
+    if not (mount := description.get("mount")):
+        return np.column_stack([xy_mm * 1e-3, np.zeros(len(xy_mm))])
+    size_mm = (float(description["width_mm"]), float(description["height_mm"]))
+    share = np.clip(xy_mm / size_mm + 0.5, 0.0, 1.0)
+    return appearance.surface_points(mount["surface_m"], share[:, 0], share[:, 1])
 
 
 def _text(text: str, pose: fox.Pose, colour: fox.Color, pixels: float) -> fox.TextPrimitive:
@@ -262,13 +358,15 @@ def sheet_scene(sensor: str, description: Mapping[str, Any], time_ns: int) -> fo
     inner = description.get("sensing_width_mm"), description.get("sensing_height_mm")
     if inner[0] and inner[1] and inner != (width, height):
         lines.append(_outline(description, float(inner[0]), float(inner[1]), thin, 1.0))
-    cubes, texts = [], []
-    for number, (x, y) in enumerate(description.get("electrodes_mm") or []):
-        cubes.append(_electrode(x, y, width))
-        texts.append(_text(str(number), _pose(1.07 * x, 1.07 * y, 0.0), thin, 11.0))
+    electrodes = np.array(description.get("electrodes_mm") or []).reshape(-1, 2)
+    names = _points(description, electrodes * (1.0 if description.get("mount") else 1.07))
+    cubes = [_electrode(_at(*point), width) for point in _points(description, electrodes).tolist()]
+    texts = [
+        _text(str(number), _at(*point), thin, 11.0) for number, point in enumerate(names.tolist())
+    ]
     entity = fox.SceneEntity(
         timestamp=to_timestamp(time_ns),
-        frame_id=sensor,
+        frame_id=frame_of(sensor, description),
         id="sheet",
         frame_locked=True,
         lines=lines,
@@ -290,21 +388,25 @@ def _outline(
         turns = np.linspace(0.0, 2.0 * np.pi, 96, endpoint=False)
         xy = np.column_stack([np.cos(turns) * width_mm, np.sin(turns) * height_mm]) / 2
     else:
-        xy = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (width_mm / 2, height_mm / 2)
+        side = np.linspace(-1.0, 1.0, 25 if description.get("mount") else 2)[:-1]
+        edge = np.ones_like(side)
+        sides = ((side, -edge), (edge, side), (-side, edge), (-edge, -side))
+        xy = np.concatenate([np.column_stack(each) for each in sides])
+        xy *= (width_mm / 2, height_mm / 2)
     return fox.LinePrimitive(
         type=fox.LinePrimitiveLineType.LineLoop,
         pose=fox.Pose(position=fox.Vector3(), orientation=_UPRIGHT),
         thickness=pixels,
         scale_invariant=True,
-        points=[fox.Point3(x=x, y=y, z=0.0) for x, y in (xy * 1e-3).tolist()],
+        points=[fox.Point3(x=x, y=y, z=z) for x, y, z in _points(description, xy).tolist()],
         color=colour,
     )
 
 
-def _electrode(x_mm: float, y_mm: float, width_mm: float) -> fox.CubePrimitive:
+def _electrode(pose: fox.Pose, width_mm: float) -> fox.CubePrimitive:
     side = 0.02 * width_mm * 1e-3
     return fox.CubePrimitive(
-        pose=_pose(x_mm, y_mm, 0.0),
+        pose=pose,
         size=fox.Vector3(x=side, y=side, z=side / 2),
         color=fox.Color(r=0.85, g=0.65, b=0.3, a=1.0),
     )

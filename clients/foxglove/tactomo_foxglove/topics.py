@@ -6,6 +6,7 @@ topic                  schema                      what
 /tf                    foxglove.FrameTransforms    where the sensor hangs
 /SENSOR/sheet          foxglove.SceneUpdate        outline and electrodes
 /SENSOR/contacts       foxglove.SceneUpdate        a disc for each contact, its height the pressure
+/SENSOR/surface        foxglove.SceneUpdate        the map on the surface of a mounted sheet
 /SENSOR/grid           foxglove.Grid               the map: colours, pressure_kpa, magnitude, ...
 /SENSOR/image          foxglove.RawImage           the map as a picture
 /SENSOR/annotations    foxglove.ImageAnnotations   the contacts on that picture
@@ -53,6 +54,7 @@ def _numbers(*names: str) -> dict[str, Any]:
 
 _JSON: Final = {
     **{"int": _INTEGER, "Unsigned": _INTEGER, "str": _TEXT, "bool": _TRUTH},
+    "tuple[float, float, float]": _list(_NUMBER),
     "frozenset[str]": _list(_TEXT),
 }
 FRAME_NUMBERS: Final = (
@@ -121,6 +123,7 @@ class SensorTopics:
 
         self._sheet = channels.SceneUpdateChannel(topic("sheet"), context=context)
         self._contacts = channels.SceneUpdateChannel(topic("contacts"), context=context)
+        self._surface = channels.SceneUpdateChannel(topic("surface"), context=context)
         self._grid = channels.GridChannel(topic("grid"), context=context)
         self._image = channels.RawImageChannel(topic("image"), context=context)
         self._annotations = channels.ImageAnnotationsChannel(topic("annotations"), context=context)
@@ -158,13 +161,17 @@ class SensorTopics:
 
     def _hang(self, time_ns: int) -> None:
         self._transforms.log(
-            messages.transforms(self.sensor, self._placement, time_ns), log_time=time_ns
+            messages.transforms(
+                messages.frame_of(self.sensor, self.description), self._placement, time_ns
+            ),
+            log_time=time_ns,
         )
 
     def _show(self, frame: Frame, time_ns: int, stale: str) -> None:
         """Draw a frame, as far as anybody looks."""
         drawings: tuple[tuple[Any, Callable[..., Any]], ...] = (
             (self._contacts, messages.contacts_scene),
+            (self._surface, messages.surface),
             (self._grid, messages.grid),
             (self._image, messages.image),
             (self._annotations, messages.image_annotations),

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
@@ -88,6 +88,49 @@ def _measured(contact: Contact, value: float, sigma: float | None, unit: str) ->
     if contact.pressure_range == "above":
         return f"≥ {value:.0f} {unit}"
     return f"{value:.0f}{'' if sigma is None else f' ± {sigma:.0f}'} {unit}"
+
+
+def surface_points(
+    surface_m: Sequence[Sequence[Sequence[float]]],
+    x_share: NDArray[np.float64],
+    y_share: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return where on a mounted sheet's surface places are, linear between the status's points.
+
+    Args:
+        surface_m: of a status's ``description.mount``, (rows, columns, 3).
+        x_share: how far from the left edge to the right one, 0 to 1; any shape.
+        y_share: how far from the bottom to the top, likewise.
+
+    Returns:
+        Points in the frame of the mount's link, metres: that shape and 3.
+    """
+    points = np.asarray(surface_m, dtype=float)
+    rows, columns, _ = points.shape
+    along_y, along_x = y_share * (rows - 1), x_share * (columns - 1)
+    row = np.clip(along_y.astype(int), 0, rows - 2)
+    column = np.clip(along_x.astype(int), 0, columns - 2)
+    up, right = (along_y - row)[..., None], (along_x - column)[..., None]
+    below = points[row, column] * (1 - right) + points[row, column + 1] * right
+    above = points[row + 1, column] * (1 - right) + points[row + 1, column + 1] * right
+    return np.asarray(below * (1 - up) + above * up)
+
+
+def surface_nodes(
+    surface_m: Sequence[Sequence[Sequence[float]]], shape: tuple[int, ...]
+) -> NDArray[np.float64]:
+    """Return where a map's nodes are on a mounted sheet's surface: (ny, nx, 3), metres."""
+    rows, columns = (np.linspace(0.0, 1.0, count) for count in shape)
+    return surface_points(surface_m, *np.meshgrid(rows, columns, indexing="ij")[::-1])
+
+
+def towards(normal: Sequence[float]) -> tuple[float, float, float, float]:
+    """Return the shortest rotation that turns z into a unit vector: (x, y, z, w)."""
+    x, y, z = normal
+    length = math.hypot(x, y, 1.0 + z)
+    if length < 1e-9:  # straight down: about x, as well as about any other
+        return 1.0, 0.0, 0.0, 0.0
+    return -y / length, x / length, 0.0, (1.0 + z) / length
 
 
 WORLD: Final = "world"

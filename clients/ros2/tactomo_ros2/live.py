@@ -8,6 +8,7 @@ from typing import Final
 
 from tactomo_client import Event, Frame, Status, Subscription
 from tactomo_client.appearance import Placement
+from tactomo_client.schema import Mount
 
 from tactomo_ros2.messages import (
     RosMessage,
@@ -34,14 +35,17 @@ def run(
         KeysError: the daemon does not let us in.
     """
     last: Frame | None = None
+    mount: Mount | None = None
     due_s = time.monotonic() + REMIND_S
     while not is_over():
         item = skin.wait(WAIT_S)
         if isinstance(item, Status):
+            mount = None if item.description is None else item.description.mount
             publish(issue_diagnostics(item, time.time_ns()))
         elif isinstance(item, Frame):
             last = item
-            for message in ros_messages(last, last.acquired_realtime_ns, last.age_s, placement):
+            at_ns = last.acquired_realtime_ns
+            for message in ros_messages(last, at_ns, last.age_s, placement, mount):
                 publish(message)
             due_s = time.monotonic() + REMIND_S
         if time.monotonic() >= due_s:

@@ -16,6 +16,8 @@ topic                      type                                  message
 
 Stamps are when the scan was acquired. The frame SENSOR has its origin at the sheet's centre, x to
 the right, y up, z out of the pressed side (REP 103: metres, newtons; kilopascals are named so).
+Where the sensor description has a [mount], map, contacts and poses are in the link's frame instead,
+on the sheet's surface there, and /tf goes from the link to SENSOR/contact_ID, z along the normal.
 What is unknown is NaN, or absent; docs/ros2.md says more.
 """
 
@@ -23,15 +25,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 from tactomo_client import Contact, Frame, Status
-from tactomo_client.appearance import Placement
-from tactomo_client.schema import PRESSURE_RANGES
+from tactomo_client.appearance import Placement, surface_nodes, towards
+from tactomo_client.schema import PRESSURE_RANGES, Mount, table_row
+from tactomo_client.touch import CONTACT_COLUMNS
 
 TYPES: Final = get_typestore(Stores.ROS2_HUMBLE)
 """Definitions; their hashes are the same up to Kilted and, but for Humble, part of the wire."""
@@ -39,8 +41,8 @@ CONTACT_POINT: Final = np.dtype(
     [
         *((axis, "<f4") for axis in "xyz"),
         *(
-            (field.name, {"int": "<u4", "str": "u1", "bool": "u1"}.get(str(field.type), "<f8"))
-            for field in fields(Contact)
+            (name, {"id": "<u4", "pressure_range": "u1", "taught": "u1"}.get(name, "<f8"))
+            for name in CONTACT_COLUMNS
         ),
     ]
 )
@@ -51,6 +53,8 @@ MAP_POINT: Final = np.dtype(
         ("valid", "u1"),
     ]
 )
+Vector: TypeAlias = tuple[float, float, float]
+Quaternion: TypeAlias = tuple[float, float, float, float]
 _POINT_FIELD: Final = {"u1": "UINT8", "u4": "UINT32", "f4": "FLOAT32", "f8": "FLOAT64"}
 
 
@@ -82,7 +86,11 @@ def topic_name(sensor: str) -> str:
 
 
 def ros_messages(
-    frame: Frame, time_ns: int, age_s: float | None, placement: Placement | None = None
+    frame: Frame,
+    time_ns: int,
+    age_s: float | None,
+    placement: Placement | None = None,
+    mount: Mount | None = None,
 ) -> Iterator[RosMessage]:
     """Yield what a frame says; a frame without images has no map.
 
@@ -91,6 +99,8 @@ def ros_messages(
         time_ns: when it was acquired, ROS time: nanoseconds since 1970.
         age_s: how old it was when it was published; None where nobody knows it.
         placement: where the sensor hangs; None where the robot's own description says so.
+        mount: the link that carries the sheet, by the sensor's status; None: the map is flat, in
+            the sensor's own frame. Contacts know their link themselves.
     """
     types = topic_types(frame.sensor)
     cloud, contacts, wrenches, poses, tf, diagnostics = types
@@ -99,9 +109,10 @@ def ros_messages(
     told = "stale" if frame.is_stale else ", ".join(sorted(frame.flags)) or "ok"
     trust = _diagnostics(frame.sensor, header, told, _trust(frame, age_s), level)
     said: list[tuple[str, Any]] = [(diagnostics, trust)]
-    if (points := _map_points(frame)) is not None:
-        said.append((cloud, _cloud(points, header)))
-    said.append((contacts, _cloud(_contact_points(frame), header)))
+    if (points := _map_points(frame, mount)) is not None:
+        said.append((cloud, _cloud(points, header if mount is None else _in(header, mount.frame))))
+    of_contacts = _in(header, next((c.frame for c in frame.contacts if c.frame), frame.sensor))
+    said.append((contacts, _cloud(_contact_points(frame), of_contacts)))
     for contact in frame.contacts:
         said.append((wrenches, _wrench(frame, contact, header.stamp)))
         said.append((poses, _pose(contact, header)))
@@ -109,6 +120,10 @@ def ros_messages(
         said.append((tf, _new("tf2_msgs/msg/TFMessage", transforms=transforms)))
     for topic, message in said:
         yield RosMessage(topic, types[topic], bytes(TYPES.serialize_cdr(message, types[topic])))
+
+
+def _in(header: Any, frame_id: str) -> Any:
+    return _new("std_msgs/msg/Header", stamp=header.stamp, frame_id=frame_id)
 
 
 def _new(kind: str, **values: Any) -> Any:
@@ -150,7 +165,7 @@ def _cloud(points: NDArray[np.void], header: Any) -> Any:
     )
 
 
-def _map_points(frame: Frame) -> NDArray[np.void] | None:
+def _map_points(frame: Frame, mount: Mount | None) -> NDArray[np.void] | None:
     """Return the sheet's nodes, (ny, nx); None for a frame without images."""
     images = {
         "pressure_kpa": frame.pressure_kpa,
@@ -166,6 +181,9 @@ def _map_points(frame: Frame) -> NDArray[np.void] | None:
     for name, image in images.items():
         points[name] = np.nan if image is None else image
     points["sigma_kpa"] = _sigma_kpa(frame, points)
+    if mount is not None:
+        on_link = surface_nodes(mount.surface_m, shape)
+        points["x"], points["y"], points["z"] = np.moveaxis(on_link, -1, 0)
     points["valid"] = np.isfinite(points["pressure_kpa"]) & frame.is_known
     return points
 
@@ -190,12 +208,14 @@ def _contact_points(frame: Frame) -> NDArray[np.void]:
     """Return a point for each contact, with all that is known of it."""
     points = np.zeros(len(frame.contacts), CONTACT_POINT)
     for point, contact in zip(points, frame.contacts, strict=True):
-        for field in fields(Contact):
-            value = getattr(contact, field.name)
-            if field.name == "pressure_range":
+        cells = table_row(contact)
+        for name in CONTACT_COLUMNS:
+            value = cells[name]
+            if name == "pressure_range":
                 value = PRESSURE_RANGES.index(value) if value in PRESSURE_RANGES else 0
-            point[field.name] = np.nan if value is None else value
-        point["x"], point["y"] = contact.x_mm * 1e-3, contact.y_mm * 1e-3
+            point[name] = np.nan if value is None else value
+        _, position, _ = _whereabouts(contact, frame.sensor)
+        point["x"], point["y"], point["z"] = position
     return points
 
 
@@ -213,45 +233,63 @@ def _wrench(frame: Frame, contact: Contact, stamp: Any) -> Any:
 
 
 def _pose(contact: Contact, header: Any) -> Any:
-    """Return a contact's centre; it lies in the sheet's plane, turned as the sheet is."""
-    covariance = np.zeros(36)
-    covariance[[0, 7]] = [
+    """Return a contact's centre; its z is the sheet's normal there.
+
+    On a mounted sheet the larger one of the centre's two uncertainties stands for both, since a
+    contact does not say how the sheet's x lies on the link.
+    """
+    variances = [
         np.nan if sigma is None else (sigma * 1e-3) ** 2
         for sigma in (contact.x_sigma_mm, contact.y_sigma_mm)
     ]
+    covariance = np.zeros((6, 6))
+    covariance[[0, 1], [0, 1]] = variances
+    if contact.normal is not None:
+        tangent = np.eye(3) - np.outer(contact.normal, contact.normal)
+        covariance[:3, :3] = np.max(variances) * tangent
+    parent, position, (x, y, z, w) = _whereabouts(contact, header.frame_id)
     pose = _new(
         "geometry_msgs/msg/Pose",
-        position=_vector(contact.x_mm * 1e-3, contact.y_mm * 1e-3, 0.0, "Point"),
-        orientation=_new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+        position=_vector(*position, "Point"),
+        orientation=_new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
     )
-    with_covariance = _new("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance)
+    with_covariance = _new(
+        "geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance.ravel()
+    )
+    header = _in(header, parent)
     return _new("geometry_msgs/msg/PoseWithCovarianceStamped", header=header, pose=with_covariance)
 
 
 def _transforms(frame: Frame, header: Any, placement: Placement | None) -> list[Any]:
-    def transform(header: Any, child: str, placed: Placement) -> Any:
-        x, y, z, w = placed.quaternion
+    def transform(parent: str, child: str, position: Vector, turned: Quaternion) -> Any:
+        x, y, z, w = turned
         pose = _new(
             "geometry_msgs/msg/Transform",
-            translation=_vector(placed.x_m, placed.y_m, placed.z_m),
+            translation=_vector(*position),
             rotation=_new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
         )
         return _new(
             "geometry_msgs/msg/TransformStamped",
-            header=header,
+            header=_in(header, parent),
             child_frame_id=child,
             transform=pose,
         )
 
     hung = []
     if placement is not None:
-        parent = _new("std_msgs/msg/Header", stamp=header.stamp, frame_id=placement.parent)
-        hung = [transform(parent, frame.sensor, placement)]
-    centres = [
-        (contact, Placement(frame.sensor, contact.x_mm * 1e-3, contact.y_mm * 1e-3))
-        for contact in frame.contacts
-    ]
-    return hung + [transform(header, _contact_frame(frame, c), centre) for c, centre in centres]
+        at = (placement.x_m, placement.y_m, placement.z_m)
+        hung = [transform(placement.parent, frame.sensor, at, placement.quaternion)]
+    for contact in frame.contacts:
+        parent, position, turned = _whereabouts(contact, frame.sensor)
+        hung.append(transform(parent, _contact_frame(frame, contact), position, turned))
+    return hung
+
+
+def _whereabouts(contact: Contact, sensor: str) -> tuple[str, Vector, Quaternion]:
+    """Return the frame that a contact is in, its centre in m, and how its own frame is turned."""
+    if contact.position_m is None or contact.normal is None or contact.frame is None:
+        return sensor, (contact.x_mm * 1e-3, contact.y_mm * 1e-3, 0.0), (0.0, 0.0, 0.0, 1.0)
+    return contact.frame, contact.position_m, towards(contact.normal)
 
 
 def _contact_frame(frame: Frame, contact: Contact) -> str:

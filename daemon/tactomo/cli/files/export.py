@@ -158,6 +158,11 @@ def _kind(output: Path) -> str:
 
 
 def _writer(kind: str, parent: str | None, pose: str, scratch: Path) -> Writer:
+    from tactomo_client.filled import filled
+    from tactomo_client.schema import Mount
+
+    from tactomo.imaging.frames import description_fields
+
     if kind == ".csv":
         from tactomo.cli.files.csv import write_contacts
 
@@ -170,8 +175,6 @@ def _writer(kind: str, parent: str | None, pose: str, scratch: Path) -> Writer:
         with needs("Foxglove", "pip install 'tactomo[foxglove]'"):
             from tactomo_foxglove import write_mcap
 
-        from tactomo.imaging.frames import description_fields
-
         placement = placement_of(parent or "world", pose)
 
         def write(frames: RecordedFrames, moments: Moments, file: IO[bytes]) -> int:
@@ -182,9 +185,13 @@ def _writer(kind: str, parent: str | None, pose: str, scratch: Path) -> Writer:
     with needs("a ROS 2 bag", "pip install 'tactomo[ros2]'"):
         from tactomo_ros2.bag import write_bag
     hung = None if parent is None else placement_of(parent, pose)
-    return lambda frames, moments, folder: write_bag(
-        _timed(frames, moments), folder, frames.sensor, hung
-    )
+
+    def write_folder(frames: RecordedFrames, moments: Moments, folder: Path) -> int:
+        about = {} if frames.description is None else description_fields(frames.description)
+        mount = filled(Mount, about["mount"]) if about.get("mount") else None
+        return write_bag(_timed(frames, moments), folder, frames.sensor, hung, mount)
+
+    return write_folder
 
 
 def _dataset_writer(
