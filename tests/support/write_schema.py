@@ -168,9 +168,9 @@ def _event_words(schema: dict[str, list[Field]], name: str) -> str:
     kind = EVENTS[name]
     words = [_markdown(meaning)]
     if kind.end:
-        words.append(f"Told once, until `{kind.end}`.")
+        words.append(f"Sent once until `{kind.end}`.")
     if kind.period_s > 1:
-        words.append(f"The next one {kind.period_s:g} s later at the earliest.")
+        words.append(f"At most once in {kind.period_s:g} s.")
     return " ".join(word for word in words if word)
 
 
