@@ -313,7 +313,7 @@ class Reconstructor:
                 misfit = max(each.misfit for each in changes.values())
                 if misfit > BAD_MISFIT:
                     flags |= Flag.MISFIT_HIGH
-        blank = np.zeros((self.description.map.nodes_y, self.description.map.nodes_x), np.float32)
+        blank = self._image(np.zeros((self.description.map.nodes_y, self.description.map.nodes_x)))
         magnitude = blank if Channel.MAGNITUDE in changes else None
         return Reconstruction(
             map=magnitude,
@@ -365,9 +365,9 @@ class Reconstructor:
         if estimate.tells_pressure and has_magnitude:
             pressure = pressure_map(areas, contacts, account.pressure_kpa if account else None)
         return Reconstruction(
-            map=_image(estimate.map),
-            pressure_kpa=pressure,
-            structure=_image(estimate.structure),
+            map=self._image(estimate.map),
+            pressure_kpa=self._image(pressure),
+            structure=self._image(estimate.structure),
             contacts=contacts,
             tier=tier,
             reason="; ".join([estimate.reason, *measurement.faults]),
@@ -378,6 +378,13 @@ class Reconstructor:
             force_n=force_n,
             force_sigma_n=force_sigma_n,
         )
+
+    def _image(self, values: FloatArray | Image | None) -> Image | None:
+        """What a frame shows: NaN off a polygon."""
+        off_sheet = self.description.off_sheet
+        if values is None or off_sheet is None:
+            return None if values is None else np.asarray(values, np.float32)
+        return np.where(off_sheet, np.float32(np.nan), values).astype(np.float32)
 
     def _areas_of(self, estimate: Estimate) -> tuple[Areas, FloatArray, FloatArray]:
         """The pressed areas of an estimate, their magnitudes (K,) and uncertainties (K,)."""
@@ -409,7 +416,3 @@ def _is_ours(method: Method) -> bool:
 
 def _in_words(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
-
-
-def _image(values: FloatArray | Image | None) -> Image | None:
-    return None if values is None else np.asarray(values, np.float32)

@@ -501,11 +501,16 @@ class SensorDescription:
     sha256: str = ""  #: Hash of the description
     #: The description's file on the daemon's computer; nil for a shipped description
     file: str | None = None
-    shape: str = ""  #: ``rectangle`` or ``disc``
+    shape: str = ""  #: ``rectangle``, ``disc`` or ``polygon``
     width_mm: float | Absent = None  #: Width of the sheet's bounding box
     height_mm: float | Absent = None  #: Height of the sheet's bounding box
     sensing_width_mm: float | Absent = None  #: Width of the area that can be pressed, centred
     sensing_height_mm: float | Absent = None  #: Height of the area that can be pressed, centred
+    #: Corners, x and y, of each ring of the sheet's outline: the outer ring counter-clockwise, then
+    #: the holes
+    outline_mm: tuple[tuple[tuple[float, float], ...], ...] = ()
+    #: Corners of each ring of the area that can be pressed, which may be several pieces
+    sensing_outline_mm: tuple[tuple[tuple[float, float], ...], ...] = ()
     #: Centre of each electrode, x and y, electrode 0 first
     electrodes_mm: tuple[tuple[float, float], ...] = ()
     modalities: tuple[str, ...] = ()  #: The sensor's channels: ``magnitude``, ``structure``

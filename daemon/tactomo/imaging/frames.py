@@ -100,6 +100,8 @@ def description_fields(description: SensorDescription) -> dict[str, Any]:
         "height_mm": height_m * MM_PER_M,
         "sensing_width_mm": (width_m - frame_m) * MM_PER_M,
         "sensing_height_mm": (height_m - frame_m) * MM_PER_M,
+        "outline_mm": _rings_mm(description, 0.0),
+        "sensing_outline_mm": _rings_mm(description, description.sheet.frame_width_m),
         "electrodes_mm": (description.electrode_centres_m * MM_PER_M).tolist(),
         "modalities": list(description.channels),
         "magnitude_max": magnitude_max(description),
@@ -120,6 +122,11 @@ def mount_fields(description: SensorDescription, mount: Mount) -> dict[str, Any]
         "kind": mount.kind,
         "surface_m": np.round(points, 6).reshape((*places.shape[:2], 3)).tolist(),
     }
+
+
+def _rings_mm(description: SensorDescription, inset_m: float) -> list[list[list[float]]]:
+    rings = description.sheet.outline.drawn(inset_m)
+    return [np.round(ring * MM_PER_M, 3).tolist() for ring in rings]
 
 
 def pressure_fields(

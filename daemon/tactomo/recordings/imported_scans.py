@@ -194,7 +194,7 @@ def read_scans(
 
 def _turned_round(scans: Scans, description: SensorDescription) -> Scans:
     """The scans with plus and minus exchanged in each channel whose voltages have wrong signs."""
-    if description.instrument.voltages != "signed":
+    if description.instrument.voltages != "signed" or not description.runs_round:
         return scans
     signs = rim_signs(description.pairs, description.electrode_count)
     wrong = []

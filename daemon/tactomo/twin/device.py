@@ -333,10 +333,10 @@ class Twin:
         press, sensor = arguments.press(), self.config.description
         reach_m = max(press.radius_m, press.radius_y_m or 0.0)
         if not sensor.on_sheet(np.array(press.x_m), np.array(press.y_m), -reach_m):
-            round_ = sensor.sheet.shape == "disc"
+            shape = {"disc": "round, ", "polygon": "a polygon of "}.get(sensor.sheet.shape, "")
             raise CommandError(
                 f"x_mm = {arguments.x_mm:g}, y_mm = {arguments.y_mm:g} is off the sheet",
-                f"{sensor.name} is {'round, ' if round_ else ''}{1e3 * sensor.width_m:g} x "
+                f"{sensor.name} is {shape}{1e3 * sensor.width_m:g} x "
                 f"{1e3 * sensor.height_m:g} mm, and 0, 0 is its middle",
                 name="bad_argument",
             )

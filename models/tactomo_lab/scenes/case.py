@@ -203,7 +203,7 @@ def _warped(mesh: SheetMesh, plan: Plan, sensor: SensorDescription) -> SheetMesh
     """Where the nodes are on a skin that is stretched or has electrodes off their places."""
     if plan.displaced_m:
         mesh = displaced(mesh, sensor, np.array(plan.displaced_m))
-    return SheetMesh(mesh.mesh.scaled((1 + plan.stretch, 1.0)), mesh.electrode_facets)
+    return replace(mesh, mesh=mesh.mesh.scaled((1 + plan.stretch, 1.0)))
 
 
 def _kept(what: str, make: Callable[[], SimulatedVolts]) -> SimulatedVolts:

@@ -9,7 +9,7 @@ and jumps at an outline, while what inverts has it linear between its nodes.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import skfem
@@ -21,7 +21,7 @@ from tactomo_models.physics.bare_sheet import (
     transfer_resistances,
     volts_per_unit,
 )
-from tactomo_models.physics.mesh import SheetMesh, electrode_facets, mesh_sheet
+from tactomo_models.physics.mesh import SheetMesh, mesh_sheet, with_electrodes
 from tactomo_models.scene.press import Press, Shape, strongest
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.response import (
@@ -187,7 +187,7 @@ def fitted_mesh(
             corners = press.coverage(x, y, SHARP_M)[mesh.t]
             cut |= corners.max(axis=0) != corners.min(axis=0)
         mesh = mesh.refined(np.flatnonzero(cut))
-    return SheetMesh(mesh, electrode_facets(mesh, description))
+    return with_electrodes(mesh, description)
 
 
 def displaced(
@@ -206,9 +206,7 @@ def displaced(
     off = sheet.mesh.p.T[:, None, :] - centres
     reach_m = min(ELECTRODE_REACH_M, REACH_SHARE * float(pdist(centres).min()))
     pull = np.exp(-0.5 * (off**2).sum(axis=2) / reach_m**2)
-    return SheetMesh(
-        skfem.MeshTri(sheet.mesh.p + (pull @ step).T, sheet.mesh.t), sheet.electrode_facets
-    )
+    return replace(sheet, mesh=skfem.MeshTri(sheet.mesh.p + (pull @ step).T, sheet.mesh.t))
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ Inverse Probl. Imaging 6 (2012).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import skfem
@@ -202,9 +202,7 @@ class SheetEstimator:
         """The mesh with electrodes off their places, by units of DISPLACED_M along the rim."""
         step = DISPLACED_M * places[:, None] * self._along
         mesh = self._mesh.mesh
-        return SheetMesh(
-            skfem.MeshTri(mesh.p + (self._pull @ step).T, mesh.t), self._mesh.electrode_facets
-        )
+        return replace(self._mesh, mesh=skfem.MeshTri(mesh.p + (self._pull @ step).T, mesh.t))
 
     def _slopes(self, parameters: FloatArray, shape: _Shape) -> FloatArray:
         """Derivatives (M, N) of the voltages: dR = -u^T dA u with the fields u."""

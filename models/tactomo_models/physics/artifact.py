@@ -93,10 +93,16 @@ def build_artifact(description: SensorDescription, progress: Progress | None = N
 
 
 def central_target(description: SensorDescription, bare: BareSheet) -> FloatArray:
-    """Conductivity change (P,) of the noise figure's target: a small disc at the centre."""
+    """Conductivity change (P,) of the noise figure's target: a small disc as far inside as can be.
+
+    Of places that are as far from the rim, the one nearest to the centre.
+    """
     radius = TARGET_SHARE * min(description.width_m, description.height_m)
     x, y = bare.points[:, bare.pressable]
-    return np.asarray((np.hypot(x, y) < radius).astype(float))
+    depth = description.sheet.outline.depth(x, y)
+    deepest = np.flatnonzero(depth > depth.max() - radius / 4)
+    at = deepest[np.hypot(x[deepest], y[deepest]).argmin()]
+    return np.asarray((np.hypot(x - x[at], y - y[at]) < radius).astype(float))
 
 
 def cache_folder() -> Path:

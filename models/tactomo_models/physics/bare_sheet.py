@@ -14,18 +14,21 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 import skfem
 from numpy.typing import DTypeLike
+from scipy.spatial import cKDTree
 from skfem.helpers import dot, grad
 from threadpoolctl import threadpool_limits
 
-from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.physics.greens import GreensFunction, PackedGreensFunction
 from tactomo_models.physics.mesh import SheetMesh
 from tactomo_models.sensor.description import SensorDescription
+
+NEAREST = 24  # triangles by their middles, among which a place's own is: refined ones are smaller
+MAX_SHORT = 0.05  # of the map's spacing: see `_map_weights`
 
 
 @dataclass(frozen=True)
@@ -221,6 +224,19 @@ def assemble_sheet(
             rows += [end, potential]
             columns += [potential, end]
             values += [-length / 2 / contact_m[index]] * 2
+    for index, pad, triangles, shares in sheet.pads:
+        # It meets the sheet all over; in all as a rim electrode as long as its circumference.
+        radius_m = pad.radius_m
+        weight = shares * _areas(mesh)[triangles, None, None] * 2 / radius_m / contact_m[index]
+        corners = mesh.t[:, triangles].T  # (n, 3)
+        rows.append(np.repeat(corners, 3, axis=1).ravel())
+        columns.append(np.tile(corners, 3).ravel())
+        values.append(weight.ravel())
+        potential = np.full(corners.size, nodes + index)
+        rows += [corners.ravel(), potential]
+        columns += [potential, corners.ravel()]
+        values += [-weight.sum(axis=2).ravel()] * 2
+        lengths[index] = 2 * np.pi * radius_m
     potentials = nodes + np.arange(electrodes)
     rows.append(potentials)
     columns.append(potentials)
@@ -231,23 +247,36 @@ def assemble_sheet(
     return (stiffness + sp.csr_matrix(terms, (size, size)))[:-1, :-1].tocsc()
 
 
+def _areas(mesh: skfem.MeshTri) -> FloatArray:
+    """Area of each triangle, (T,)."""
+    a, b, c = mesh.p[:, mesh.t].transpose(1, 0, 2)
+    return np.asarray(np.abs((b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0]) / 2)
+
+
 def _map_weights(description: SensorDescription, mesh: skfem.MeshTri) -> sp.csr_matrix:
     """Linear interpolation from mesh nodes to map nodes; rows off the sheet are empty."""
     x, y = np.meshgrid(description.map_x_m, description.map_y_m)
-    # A hair inside, so that points on the rim are not lost to rounding or to the disc's facets.
-    points = np.stack([x.ravel(), y.ravel()]) * (1 - 1e-9)
-    on = np.flatnonzero(_inside_mesh(mesh, points))
-    basis = skfem.Basis(mesh, skfem.ElementTriP1())
-    # It looks for each point in the triangles near any of them: row by row these are few.
-    rows = np.split(points[:, on], np.flatnonzero(np.diff(points[1, on])) + 1, axis=1)
-    weights = sp.vstack([basis.probes(row) for row in rows]).tocsr()
-    weights.data[weights.data < 1e-7] = 0  # a trace of other corners; rounding puts some below 0
-    weights.eliminate_zeros()
-    rows = sp.csr_matrix((np.ones(len(on)), (on, np.arange(len(on)))), (x.size, len(on)))
-    return (rows @ weights).tocsr()
-
-
-def _inside_mesh(mesh: skfem.MeshTri, points: FloatArray) -> BoolArray:
-    rim = mesh.p[:, mesh.boundary_nodes()]
-    hull = scipy.spatial.Delaunay(rim.T)
-    return np.asarray(hull.find_simplex(points.T) >= 0)
+    points = np.stack([x.ravel(), y.ravel()], axis=1)
+    # On the chord of an arc, or where the rim is drawn simpler than the outline, the nearest
+    # triangle ends short of a point on the sheet; that one's nearest place stands for the point.
+    short_m = MAX_SHORT * description.width_m / (description.map.nodes_x - 1)
+    corners = mesh.p[:, mesh.t]  # (2, 3, T)
+    _, near = cKDTree(corners.mean(axis=1).T).query(points, NEAREST)
+    a, b, c = (corners[:, k, near] for k in range(3))  # (2, points, NEAREST)
+    off = points.T[:, :, None] - a
+    (ux, uy), (vx, vy) = b - a, c - a
+    twice = ux * vy - uy * vx
+    second, third = (off[0] * vy - off[1] * vx) / twice, (ux * off[1] - uy * off[0]) / twice
+    hats = np.stack([1 - second - third, second, third])  # (3, points, NEAREST)
+    best = hats.min(axis=0).argmax(axis=1)
+    rows = np.arange(len(points))
+    hats = np.clip(hats[:, rows, best], 0, None)
+    hats[hats < 1e-7] = 0  # a trace of other corners
+    hats /= hats.sum(axis=0)
+    nodes = mesh.t[:, near[rows, best]]  # (3, points)
+    at = (mesh.p[:, nodes] * hats).sum(axis=1)
+    on = np.flatnonzero(np.linalg.norm(at - points.T, axis=0) < short_m)
+    weights = (hats[:, on].T.ravel(), (np.repeat(on, 3), nodes[:, on].T.ravel()))
+    found = sp.csr_matrix(weights, (len(points), mesh.p.shape[1]))
+    found.eliminate_zeros()
+    return found

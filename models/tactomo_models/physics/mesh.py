@@ -1,6 +1,7 @@
-"""Triangle meshes of a sheet: regular inside, refined where electrodes end.
+"""Triangle meshes of a sheet: regular inside, along its rim, refined where electrodes end.
 
-The field is singular at an electrode's ends, so triangles there are halved a few times. Boundary
+The field is singular at an electrode's ends and at corners that point into the sheet, so triangles
+there are halved a few times. Boundary
 nodes are moved onto those ends: the complete electrode model converges at its full order only
 where an electrode is a whole number of edges.
 """
@@ -8,12 +9,27 @@ where an electrode is a whole number of edges.
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 import skfem
 from scipy.spatial import Delaunay
 from scipy.spatial.distance import pdist
 
 from tactomo_models.arrays import FloatArray, IntArray
+from tactomo_models.errors import DescriptionError
 from tactomo_models.sensor.description import SensorDescription
+from tactomo_models.sensor.outline import Pad, RimElectrode
+
+MIN_DEPTH = 0.35
+"""Of a regular node of a polygon inside the rim, over the nodes' distance. Rim edges are twice as
+long, so that no node lies in the circle about one and triangles follow the rim."""
+STRAIGHT = 0.02
+"""Distance from the outline, over the nodes', by which a corner of the rim may be left out."""
+ROUNDS = 12  # of halving rim edges that are not in the mesh: where the sheet is narrow
+SINGULAR_DEG = 240.0
+"""Angle of the sheet at a corner, above which triangles there are halved, too: the field is as
+r^(180/angle - 1). At the 270 degrees of an L that takes its voltages' errors from 0.41 to 0.25 %
+rms, and the largest of one from 3.0 to 1.9 %."""
+PAD_HALVINGS = 4  # of triangles, to find the share of each under a pad
 
 
 @dataclass(frozen=True)
@@ -22,39 +38,52 @@ class SheetMesh:
 
     mesh: skfem.MeshTri  # scikit-fem triangles, coordinates in metres
     electrode_facets: tuple[IntArray, ...]  # per electrode, the boundary facets it covers
+    # per pad, its electrode's number; (n,) triangles that it touches, and (n, 3, 3) integrals of
+    # the products of their hat functions over what it covers, of the triangle's area
+    pads: tuple[tuple[int, Pad, IntArray, FloatArray], ...] = ()
 
 
 def mesh_sheet(
     description: SensorDescription,  # the sensor
     # distance of the regular nodes; the map's own spacing if None, so that every map node of a
-    # rectangle is a mesh node
+    # rectangle or polygon is a mesh node, but for those next to the rim
     spacing_m: float | None = None,
-    # how often triangles at the electrodes' ends are halved; more often where electrodes or the
-    # gaps between them are narrower than the nodes' distance
+    # how often triangles at electrodes' ends and inward corners are halved; more often where
+    # electrodes or the gaps between them are narrower than the nodes' distance
     refinements: int = 3,
 ) -> SheetMesh:
-    """Mesh a sheet."""
-    disc = description.sheet.shape == "disc"
-    mesh = _disc(description, spacing_m) if disc else _rectangle(description, spacing_m)
+    """Mesh a sheet.
+
+    Raises DescriptionError where no triangles follow a polygon's rim.
+    """
+    shape = description.sheet.shape
+    generate = {"rectangle": _rectangle, "disc": _disc, "polygon": _polygon}[shape]
+    mesh = generate(description, spacing_m)
     ends = description.electrode_ends_m.reshape(-1, 2)
-    if not disc:  # the rim of a disc begins with a node at every end
+    if shape == "rectangle":  # the other rims begin with a node at every end
         refinements = max(refinements, _needed_refinements(mesh, ends, description))
+    singular = np.concatenate([ends, description.sheet.outline.inward_corners(SINGULAR_DEG)])
     for _ in range(refinements):
-        mesh = mesh.refined(_triangles_near(mesh, ends))
-        if disc:
+        mesh = mesh.refined(_triangles_near(mesh, singular))
+        if shape == "disc":
             mesh = _on_circle(mesh, description.width_m / 2)
-    mesh = _snap(mesh, ends)
-    return SheetMesh(mesh, electrode_facets(mesh, description))
+    if shape == "rectangle":
+        mesh = _snap(mesh, ends)
+    return with_electrodes(mesh, description)
+
+
+def _grid(description: SensorDescription, spacing_m: float | None) -> tuple[FloatArray, FloatArray]:
+    if spacing_m is None:
+        return description.map_x_m, description.map_y_m
+    x, y = (
+        np.linspace(-side / 2, side / 2, round(side / spacing_m) + 1)
+        for side in (description.width_m, description.height_m)
+    )
+    return x, y
 
 
 def _rectangle(description: SensorDescription, spacing_m: float | None) -> skfem.MeshTri:
-    if spacing_m is None:
-        x, y = description.map_x_m, description.map_y_m
-    else:
-        x, y = (
-            np.linspace(-side / 2, side / 2, round(side / spacing_m) + 1)
-            for side in (description.width_m, description.height_m)
-        )
+    x, y = _grid(description, spacing_m)
     nx, ny = len(x), len(y)
     points = np.stack([np.tile(x, ny), np.repeat(y, nx)])
     corner = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).ravel()
@@ -87,6 +116,90 @@ def _disc(description: SensorDescription, spacing_m: float | None) -> skfem.Mesh
     points = np.stack([r * np.cos(a), r * np.sin(a)], axis=1)
     triangles = Delaunay(points).simplices.T
     return skfem.MeshTri(np.ascontiguousarray(points.T), np.ascontiguousarray(triangles))
+
+
+def _polygon(description: SensorDescription, spacing_m: float | None) -> skfem.MeshTri:
+    """Regular nodes inside, nodes along the rim, and the triangles between them."""
+    outline = description.sheet.outline
+    x, y = _grid(description, spacing_m)
+    step_m = max(x[1] - x[0], y[1] - y[0])
+    x, y = (each.ravel() for each in np.meshgrid(x, y))
+    deep = outline.depth(x, y) > MIN_DEPTH * step_m
+    inner = np.stack([x[deep], y[deep]], axis=1)
+    rings = [
+        _rim_nodes(description, ring, 2 * MIN_DEPTH * step_m)
+        for ring in range(len(outline.lengths_m))
+    ]
+    # The diagonal of a square of nodes is chosen by rounding: by chance, it prefers no direction.
+    shaken = inner + 1e-7 * step_m * np.random.default_rng(0).uniform(-1, 1, inner.shape)
+    for _ in range(ROUNDS):
+        rim = np.concatenate(rings)
+        triangles = Delaunay(np.concatenate([rim, shaken])).simplices
+        edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        size = len(rim) + len(inner)
+        there = np.unique(edges @ [size, 1])
+        first, missing = 0, 0
+        for number, ring in enumerate(rings):
+            places = first + np.arange(len(ring))
+            wanted = np.sort(np.stack([places, np.roll(places, -1)], axis=1), axis=1)
+            lost = np.flatnonzero(~np.isin(wanted @ [size, 1], there))
+            middle = (ring[lost] + np.roll(ring, -1, axis=0)[lost]) / 2
+            rings[number] = np.insert(ring, lost + 1, middle, axis=0)
+            first, missing = first + len(ring), missing + len(lost)
+        if not missing:
+            break
+    else:
+        raise DescriptionError(
+            f"{description.name}: {missing} edges of outline_m or holes_m are too near each other "
+            "to be meshed: leave out details smaller than an electrode"
+        )
+    points = np.concatenate([rim, inner])
+    corners = points[triangles]
+    one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = np.abs(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]) / 2
+    # Of nodes in a line rounding makes triangles without an area.
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    meshed = shapely.Polygon(rings[0], rings[1:])
+    shapely.prepare(meshed)
+    inside = shapely.contains_xy(meshed, *corners.mean(axis=1).T) & (area > 1e-7 * longest**2)
+    triangles = triangles[inside]
+    used, renumbered = np.unique(triangles, return_inverse=True)
+    return skfem.MeshTri(
+        np.ascontiguousarray(points[used].T),
+        np.ascontiguousarray(renumbered.reshape(triangles.shape).T),
+    )
+
+
+def _rim_nodes(description: SensorDescription, ring: int, step_m: float) -> FloatArray:
+    """Nodes (n, 2) along a ring: at its corners and electrodes' ends, and between them."""
+    outline = description.sheet.outline
+    length_m = outline.lengths_m[ring]
+    whole = [outline.polygon.exterior, *outline.polygon.interiors][ring]
+    corners = shapely.get_coordinates(whole.simplify(STRAIGHT * step_m / (2 * MIN_DEPTH)))[:-1]
+    along = shapely.line_locate_point(whole, shapely.points(corners))
+    ends = (
+        np.array(
+            [
+                each.ends_m()
+                for each in description.placed_electrodes
+                if isinstance(each, RimElectrode) and each.ring == ring
+            ]
+        ).ravel()
+        % length_m
+    )
+    # A corner next to an electrode's end is left to the end: a longer way round is no shorter.
+    apart = np.abs(along[:, None] - ends) % length_m
+    if len(ends):
+        corners_kept = np.minimum(apart, length_m - apart).min(axis=1) > 1e-6
+        along, corners = along[corners_kept], corners[corners_kept]
+    fixed, order = np.unique(np.append(along, ends), return_index=True)
+    places = np.concatenate([corners, outline.at(ring, ends).reshape(-1, 2)])[order]
+    nodes = []
+    gaps = np.diff(np.append(fixed, fixed[0] + length_m))
+    for place, after, gap in zip(places, np.roll(places, -1, axis=0), gaps, strict=True):
+        pieces = max(1, int(np.ceil(gap / step_m - 1e-9)))
+        nodes.append(place + (after - place) * np.arange(pieces)[:, None] / pieces)
+    return np.concatenate(nodes)
 
 
 def _triangles_near(mesh: skfem.MeshTri, points: FloatArray) -> IntArray:
@@ -129,19 +242,45 @@ def _snap(mesh: skfem.MeshTri, ends: FloatArray) -> skfem.MeshTri:
     return skfem.MeshTri(points, mesh.t)
 
 
-def electrode_facets(mesh: skfem.MeshTri, description: SensorDescription) -> tuple[IntArray, ...]:
-    """Boundary facets that each electrode covers, on a mesh with nodes at the electrodes' ends."""
+def with_electrodes(mesh: skfem.MeshTri, description: SensorDescription) -> SheetMesh:
+    """Find what each electrode covers, on a mesh with nodes at the electrodes' ends."""
+    outline = description.sheet.outline
     facets = mesh.boundary_facets()
     middle = mesh.p[:, mesh.facets[:, facets]].mean(axis=1)  # (2, facets)
-    found = []
-    for start, end in description.electrode_ends_m:
-        centre = (start + end) / 2
-        along = end - start
-        length = np.linalg.norm(along)
-        offset = middle - centre[:, None]
-        # A hair less than half: a facet round the corner may begin where the electrode ends.
-        on = (np.abs(along @ offset) / length < (1 - 1e-9) * length / 2) & (
-            np.linalg.norm(offset, axis=0) < length
-        )
+    rings, along = outline.locate(middle.T)
+    found, pads = [], []
+    for number, electrode in enumerate(description.placed_electrodes):
+        if isinstance(electrode, Pad):
+            found.append(facets[:0])
+            pads.append((number, electrode, *_under(mesh, electrode)))
+            continue
+        length_m = outline.lengths_m[electrode.ring]
+        off = np.abs((along - electrode.middle_m + length_m / 2) % length_m - length_m / 2)
+        # A hair less than half: a facet may begin where the electrode ends.
+        on = (rings == electrode.ring) & (off < (1 - 1e-9) * electrode.length_m / 2)
         found.append(facets[on])
-    return tuple(found)
+    return SheetMesh(mesh, tuple(found), tuple(pads))
+
+
+def _under(mesh: skfem.MeshTri, pad: Pad) -> tuple[IntArray, FloatArray]:
+    """Triangles that a pad touches, and what it covers of them; see `SheetMesh.pads`."""
+    pieces = 2**PAD_HALVINGS
+    i, j = np.divmod(np.arange(pieces * pieces), pieces)
+    i, j = i[i + j < pieces], j[i + j < pieces]
+    down = i + j < pieces - 1  # small triangles the other way up lie between those
+    first = np.concatenate([i + 1 / 3, i[down] + 2 / 3]) / pieces
+    second = np.concatenate([j + 1 / 3, j[down] + 2 / 3]) / pieces
+    hats = np.stack([1 - first - second, first, second])  # (3, q) at their middles
+    corners = mesh.p[:, mesh.t]  # (2, 3, T)
+    centre = np.array(pad.centre_m)
+    size = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=0).max(axis=0)
+    off = np.linalg.norm(corners.mean(axis=1) - centre[:, None], axis=0)
+    near = np.flatnonzero(off < pad.radius_m + size)
+    places = np.einsum("dct,cq->tdq", corners[:, :, near], hats)
+    under = np.linalg.norm(places - centre[:, None], axis=1) < pad.radius_m  # (n, q)
+    near, under = near[under.any(axis=1)], under[under.any(axis=1)]
+    shares = np.einsum("tq,aq,bq->tab", under.astype(float), hats, hats) / len(first)
+    a, b, c = corners[:, :, near].transpose(1, 0, 2)
+    area = np.abs((b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0]) / 2
+    covered = (under.mean(axis=1) * area).sum()
+    return near, shares * np.pi * pad.radius_m**2 / covered

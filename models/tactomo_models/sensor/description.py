@@ -15,10 +15,11 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.sensor.mount import Mount
+from tactomo_models.sensor.outline import Pad, RimElectrode
 from tactomo_models.sensor.pattern import Pairs, combined, ring_pairs
 from tactomo_models.sensor.response import MagnitudeChannel, StructureChannel
 from tactomo_models.sensor.section import Section
-from tactomo_models.sensor.sheet import Electrodes, Sheet, check_electrodes, electrode_ends
+from tactomo_models.sensor.sheet import Electrodes, Sheet, check_electrodes, placed_electrodes
 
 Electrode = Annotated[int, Field(ge=0, le=63)]
 PairList = Annotated[
@@ -29,8 +30,9 @@ PairList = Annotated[
 MAX_TABLE_BYTES = 2_000_000_000
 """Of a sensor's influence tables, which grow as the square of the map's nodes."""
 
-
 MAX_CELL_RATIO = 4
+MIN_NODES = 100
+"""Of a map on a polygon: a grid of ten by ten, the least of another sheet, has as many."""
 
 
 class Pattern(Section):
@@ -144,6 +146,11 @@ class SensorDescription(Section):
             x_m, y_m = (each.ravel() for each in np.meshgrid(self.map_x_m, self.map_y_m))
             nodes_m = np.stack([x_m, y_m], axis=-1)[self.on_sheet(x_m, y_m)]
             self.mount.check(self.sheet.size_m, nodes_m)
+        if self.off_sheet is not None and (~self.off_sheet).sum() < MIN_NODES:
+            raise ValueError(
+                f"map: {(~self.off_sheet).sum()} of its nodes lie on the sheet, and {MIN_NODES} "
+                "are needed: give more nodes_x and nodes_y"
+            )
         return self
 
     def _check_listed_pairs(self) -> None:
@@ -181,7 +188,7 @@ class SensorDescription(Section):
     @property
     def width_m(self) -> float:
         """Width of the bounding box."""
-        return self.sheet.width_m
+        return self.sheet.size_m[0]
 
     @property
     def height_m(self) -> float:
@@ -268,14 +275,48 @@ class SensorDescription(Section):
         return self.sheet.conductivity_s_m * self.sheet.thickness_m
 
     @cached_property
+    def placed_electrodes(self) -> list[RimElectrode | Pad]:
+        """Where each electrode lies."""
+        return placed_electrodes(self.sheet, self.electrodes)
+
+    @cached_property
     def electrode_ends_m(self) -> FloatArray:
-        """Both ends of every electrode on the rim, counter-clockwise: (electrodes, 2, 2)."""
-        return electrode_ends(self.sheet, self.electrodes)
+        """Both ends of every electrode, counter-clockwise on the outer rim: (electrodes, 2, 2).
+
+        A pad ends at its left and its right.
+        """
+        outline = self.sheet.outline
+        return np.stack(
+            [
+                outline.at(each.ring, each.ends_m())
+                if isinstance(each, RimElectrode)
+                else np.add(each.centre_m, [[-each.radius_m, 0.0], [each.radius_m, 0.0]])
+                for each in self.placed_electrodes
+            ]
+        )
 
     @property
     def electrode_centres_m(self) -> FloatArray:
         """Centre of every electrode, (electrodes, 2)."""
         return np.asarray(self.electrode_ends_m.mean(axis=1))
+
+    @cached_property
+    def runs_round(self) -> bool:
+        """Whether the electrodes' numbers go once round the outer rim, either way."""
+        placed = self.placed_electrodes
+        rim = [e.middle_m for e in placed if isinstance(e, RimElectrode) and e.ring == 0]
+        if len(rim) < len(placed):
+            return False
+        along = np.mod(rim, self.sheet.outline.lengths_m[0])
+        rises = np.sum(np.diff(np.append(along, along[0])) > 0)
+        return bool(rises in (1, len(along) - 1))
+
+    @cached_property
+    def off_sheet(self) -> BoolArray | None:
+        """Nodes of the map (nodes_y, nodes_x) off a polygon, which maps leave NaN; else None."""
+        if self.sheet.shape != "polygon":
+            return None
+        return ~self.on_sheet(*np.meshgrid(self.map_x_m, self.map_y_m))
 
     @cached_property
     def map_x_m(self) -> FloatArray:
@@ -290,13 +331,7 @@ class SensorDescription(Section):
     def on_sheet(self, x_m: FloatArray, y_m: FloatArray, margin_m: float = 0.0) -> BoolArray:
         """Tell which points lie on the sheet, at least `margin_m` inside its rim."""
         slack = 1e-9
-        if self.sheet.shape == "disc":
-            inside = np.hypot(x_m, y_m) <= self.width_m / 2 - margin_m + slack
-        else:
-            inside = (np.abs(x_m) <= self.width_m / 2 - margin_m + slack) & (
-                np.abs(y_m) <= self.height_m / 2 - margin_m + slack
-            )
-        return np.asarray(inside)
+        return np.asarray(self.sheet.outline.depth(x_m, y_m) >= margin_m - slack)
 
     @cached_property
     def sha256(self) -> str:
@@ -304,6 +339,14 @@ class SensorDescription(Section):
         unlisted = {key for key in ("drive", "measure") if getattr(self.pattern, key) is None}
         physics = self.model_dump_json(
             include={"schema_version", "sheet", "electrodes", "pattern", "map"},
-            exclude={"pattern": unlisted},  # hashes are older than these keys
+            exclude={  # hashes are older than these keys
+                "pattern": unlisted,
+                "sheet": {key for key in ("outline_m", "holes_m") if not getattr(self.sheet, key)},
+                "electrodes": {
+                    key
+                    for key in ("positions_m", "pad_radius_m", "clockwise")
+                    if not getattr(self.electrodes, key)
+                },
+            },
         )
         return hashlib.sha256(physics.encode()).hexdigest()

@@ -95,9 +95,9 @@ class NamedPattern(NamedTuple):
         raw = description.model_dump(by_alias=True, exclude_none=True)
         now, electrodes = description.electrode_count, raw["electrodes"]
         if now != self.electrodes:
-            if description.sheet.shape != "disc":
+            if description.electrodes.count is None:
                 raise DescriptionError(
-                    f"{description.name!r} has {now} electrodes on four sides, and the pattern has "
+                    f"{description.name!r} has {now} electrodes, and the pattern has "
                     f"{self.electrodes}; give --description with as many, or that of a disc"
                 )
             electrodes["count"] = self.electrodes

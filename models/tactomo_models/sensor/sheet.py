@@ -1,13 +1,30 @@
-"""The sheet and the electrodes on its rim: their sizes, whether they fit, and where each ends."""
+"""The sheet and its electrodes: their sizes, whether they fit, and where each lies."""
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Annotated, Literal, Self, TypeVar
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import (
+    Discriminator,
+    Field,
+    Tag,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
 
 from tactomo_models.arrays import FloatArray
+from tactomo_models.sensor.outline import (
+    Circle,
+    Outline,
+    Pad,
+    RimElectrode,
+    polygon_outline,
+    rectangle_outline,
+)
 from tactomo_models.sensor.section import Section
 
 # An electrode's impedance times the sheet's conductance. Against larger ones, simulated changes of
@@ -16,19 +33,43 @@ MIN_CONTACT = 1e-9
 # Below ten micrometres the mesh would be refined for ever.
 Metres = Annotated[float, Field(ge=1e-5, le=10, allow_inf_nan=False)]
 
+Place = Annotated[
+    tuple[Annotated[float, Field(ge=-10, le=10)], Annotated[float, Field(ge=-10, le=10)]],
+    Field(strict=False),
+]
+Ring = Annotated[tuple[Place, ...], Field(min_length=3, strict=False)]
+
 
 class Sheet(Section):
-    """The conductive sheet. A disc has `width_m` as its diameter and no height."""
+    """The conductive sheet.
 
-    shape: Literal["rectangle", "disc"]
-    width_m: Metres
+    A disc has `width_m` as its diameter and no height. A polygon has its corners, `outline_m`,
+    either way round, and those of its holes; the origin is the middle of its bounding box.
+    """
+
+    shape: Literal["rectangle", "disc", "polygon"]
+    width_m: Annotated[Metres | None, Field(validate_default=True)] = None
     height_m: Metres | None = None
+    outline_m: Ring | None = None
+    holes_m: Annotated[tuple[Ring, ...], Field(max_length=64, strict=False)] = ()
     frame_width_m: Annotated[float, Field(ge=0, le=1)] = 0.0
     conductivity_s_m: Annotated[float, Field(gt=0, le=1e8)]
     thickness_m: Annotated[float, Field(gt=0, le=1)]
 
+    @field_validator("width_m")
+    @classmethod
+    def _width_is_there(cls, width_m: float | None, given: ValidationInfo) -> float | None:
+        if width_m is None and given.data.get("shape") != "polygon":
+            raise PydanticCustomError("missing", "Field required")
+        return width_m
+
     @model_validator(mode="after")
     def _shape_has_its_size(self) -> Self:
+        is_polygon = self.shape == "polygon"
+        if is_polygon != (self.outline_m is not None) or (self.holes_m and not is_polygon):
+            raise ValueError("a polygon takes outline_m and holes_m, and no other shape does")
+        if is_polygon and (self.width_m or self.height_m):
+            raise ValueError("width_m, height_m: must be left out, outline_m is the size")
         if self.shape == "rectangle" and self.height_m is None:
             raise ValueError("height_m is required for a rectangle")
         if self.shape == "disc" and self.height_m not in (None, self.width_m):
@@ -43,9 +84,21 @@ class Sheet(Section):
             )
         return self
 
-    @property
+    @cached_property
+    def outline(self) -> Outline:
+        """Where the sheet ends."""
+        if self.outline_m is not None:
+            return polygon_outline(self.outline_m, self.holes_m)
+        width_m, height_m = self.size_m
+        return Circle(width_m / 2) if self.shape == "disc" else rectangle_outline(width_m, height_m)
+
+    @cached_property
     def size_m(self) -> tuple[float, float]:
         """Width and height of the bounding box."""
+        if self.outline_m is not None:
+            low_x, low_y, high_x, high_y = self.outline.polygon.bounds
+            return high_x - low_x, high_y - low_y
+        assert self.width_m is not None
         return self.width_m, self.height_m or self.width_m
 
 
@@ -68,7 +121,11 @@ Pitch = Annotated[
 
 
 class Electrodes(Section):
-    """Electrodes on the rim: `per_side` and `pitch_m` on a rectangle, `count` on a disc."""
+    """Electrodes: `per_side` and `pitch_m` on a rectangle, `count` on a disc, or `positions_m`.
+
+    Those listed by `positions_m` lie on the rim of a sheet of any shape, as long as `length_m`, or
+    inside, where they are round pads of `pad_radius_m`.
+    """
 
     length_m: Metres
     contact_impedance_ohm_m: Annotated[float, Field(gt=0, le=1e9)]
@@ -76,11 +133,30 @@ class Electrodes(Section):
     pitch_m: Pitch | None = None
     count: Annotated[int, Field(ge=6, le=64)] | None = None
     first_angle_deg: Annotated[float, Field(ge=-360, le=360)] = -90.0
+    positions_m: (
+        Annotated[tuple[Place, ...], Field(min_length=6, max_length=64, strict=False)] | None
+    ) = None
+    pad_radius_m: Metres | None = None
+    clockwise: bool = False
+
+    @model_validator(mode="after")
+    def _listed_once(self) -> Self:
+        if self.positions_m is None:
+            if self.pad_radius_m is not None:
+                raise ValueError("pad_radius_m: pads lie at positions_m, which is missing")
+            return self
+        if self.count or self.per_side or self.pitch_m:
+            raise ValueError("positions_m: must not be given beside count, per_side or pitch_m")
+        if self.clockwise:
+            raise ValueError(
+                "clockwise: electrodes are numbered as positions_m lists them; leave it out"
+            )
+        return self
 
     @property
     def total(self) -> int:
-        """How many there are, on a sheet of either shape."""
-        return self.count or 2 * sum(self.each_side)
+        """How many there are, on a sheet of any shape."""
+        return len(self.positions_m or ()) or self.count or 2 * sum(self.each_side)
 
     @property
     def each_side(self) -> tuple[int, int]:
@@ -102,20 +178,12 @@ def _both(given: _Number | tuple[_Number, _Number]) -> tuple[_Number, _Number]:
 
 def check_electrodes(sheet: Sheet, electrodes: Electrodes) -> None:
     """Raise ValueError, with what to change, where electrodes do not fit their sheet."""
-    if sheet.shape == "disc":
-        if electrodes.count is None or electrodes.per_side or electrodes.pitch_m:
-            raise ValueError("electrodes: a disc takes count, and no per_side or pitch_m")
-        room = np.pi * sheet.width_m / electrodes.count
+    if electrodes.positions_m is not None:
+        _check_apart(sheet.outline, placed_electrodes(sheet, electrodes))
+    elif sheet.shape == "polygon":
+        raise ValueError("electrodes: a polygon takes positions_m, and no per_side or count")
     else:
-        if electrodes.per_side is None or electrodes.pitch_m is None or electrodes.count:
-            raise ValueError("electrodes: a rectangle takes per_side and pitch_m, and no count")
-        for side, name in ((0, "width_m"), (1, "height_m")):
-            _check_side(electrodes, side, name, getattr(sheet, name))
-        room = min(electrodes.pitches_m)
-    if electrodes.length_m >= room:
-        raise ValueError(
-            f"electrodes.length_m = {electrodes.length_m}: must be below their distance, {room:.4g}"
-        )
+        _check_even(sheet, electrodes)
     impedance = electrodes.contact_impedance_ohm_m / electrodes.length_m  # ohm
     if impedance * sheet.conductivity_s_m * sheet.thickness_m < MIN_CONTACT:
         raise ValueError(
@@ -123,6 +191,60 @@ def check_electrodes(sheet: Sheet, electrodes: Electrodes) -> None:
             f"little beside the sheet's {sheet.conductivity_s_m} S/m x {sheet.thickness_m} m to "
             "compute with; check the units of all three, 1e-6 ohm m is a perfect contact"
         )
+
+
+def _check_even(sheet: Sheet, electrodes: Electrodes) -> None:
+    width_m, height_m = sheet.size_m
+    if sheet.shape == "disc":
+        if electrodes.count is None or electrodes.per_side or electrodes.pitch_m:
+            raise ValueError(
+                "electrodes: a disc takes count, and no per_side or pitch_m; or positions_m"
+            )
+        room = np.pi * width_m / electrodes.count
+    else:
+        if electrodes.per_side is None or electrodes.pitch_m is None or electrodes.count:
+            raise ValueError(
+                "electrodes: a rectangle takes per_side and pitch_m, and no count; or positions_m"
+            )
+        for side, (name, length_m) in enumerate((("width_m", width_m), ("height_m", height_m))):
+            _check_side(electrodes, side, name, length_m)
+        room = min(electrodes.pitches_m)
+    if electrodes.length_m >= room:
+        raise ValueError(
+            f"electrodes.length_m = {electrodes.length_m}: must be below their distance, {room:.4g}"
+        )
+
+
+def _check_apart(outline: Outline, electrodes: list[RimElectrode | Pad]) -> None:
+    """Raise ValueError where electrodes lie over each other."""
+    on_rim = [(n, e) for n, e in enumerate(electrodes) if isinstance(e, RimElectrode)]
+    for place, (one, first) in enumerate(on_rim):
+        for other, second in on_rim[place + 1 :]:
+            ring_m = outline.lengths_m[first.ring]
+            if first.length_m >= ring_m:
+                raise ValueError(
+                    f"electrodes.length_m = {first.length_m}: more than the ring of {ring_m:.4g} m "
+                    f"that electrode {one} lies on; give a shorter one"
+                )
+            apart = abs(first.middle_m - second.middle_m) % ring_m
+            room = min(apart, ring_m - apart) - (first.length_m + second.length_m) / 2
+            if first.ring == second.ring and room < MIN_GAP_M:
+                raise ValueError(_over(one, other, "electrodes.length_m"))
+    pads = [(n, e) for n, e in enumerate(electrodes) if isinstance(e, Pad)]
+    for place, (one, pad) in enumerate(pads):
+        for other, also in pads[place + 1 :]:
+            if np.hypot(*np.subtract(pad.centre_m, also.centre_m)) < 2 * pad.radius_m + MIN_GAP_M:
+                raise ValueError(_over(one, other, "electrodes.pad_radius_m"))
+
+
+MIN_GAP_M = 1e-5  # between electrodes: as `Metres`
+
+
+def _over(one: int, other: int, size: str) -> str:
+    return (
+        f"electrodes.positions_m[{one}] and [{other}] lie over each other: move one, or give a "
+        f"smaller {size}"
+    )
 
 
 def _check_side(electrodes: Electrodes, side: int, name: str, length_m: float) -> None:
@@ -136,32 +258,67 @@ def _check_side(electrodes: Electrodes, side: int, name: str, length_m: float) -
         )
 
 
-def electrode_ends(sheet: Sheet, electrodes: Electrodes) -> FloatArray:
-    """Both ends of every electrode on the rim, counter-clockwise: (L, 2, 2), metres."""
-    on_rim = _on_disc if sheet.shape == "disc" else _on_rectangle
-    return on_rim(sheet, electrodes)
+def placed_electrodes(sheet: Sheet, electrodes: Electrodes) -> list[RimElectrode | Pad]:
+    """Every electrode where it lies on its sheet, in the order of their numbers.
+
+    Raises ValueError where one of `positions_m` lies neither on the rim nor inside.
+    """
+    if electrodes.positions_m is not None:
+        return _listed(sheet.outline, electrodes, np.array(electrodes.positions_m))
+    middles = _on_disc if sheet.shape == "disc" else _on_rectangle
+    placed: list[RimElectrode | Pad] = [
+        RimElectrode(0, middle_m, electrodes.length_m)
+        for middle_m in middles(sheet, electrodes).tolist()
+    ]
+    return [placed[0], *placed[:0:-1]] if electrodes.clockwise else placed
+
+
+def _listed(
+    outline: Outline, electrodes: Electrodes, positions_m: FloatArray
+) -> list[RimElectrode | Pad]:
+    depth = outline.depth(*positions_m.T)
+    rings, along = outline.locate(positions_m)
+    radius_m, placed = electrodes.pad_radius_m, list[RimElectrode | Pad]()
+    for number, deep in enumerate(depth.tolist()):
+        if abs(deep) <= electrodes.length_m / 2:  # a place that was measured, not the rim's own
+            placed.append(
+                RimElectrode(int(rings[number]), float(along[number]), electrodes.length_m)
+            )
+        elif radius_m is not None and deep > radius_m:
+            placed.append(
+                Pad((float(positions_m[number, 0]), float(positions_m[number, 1])), radius_m)
+            )
+        else:
+            where = f"{1e3 * abs(deep):.3g} mm {'inside' if deep > 0 else 'off'} the rim"
+            step = (
+                "move it onto the sheet"
+                if deep < 0
+                else "give pad_radius_m if it is a pad inside, or move it onto the rim"
+                if radius_m is None
+                else f"a pad of {1e3 * radius_m:.3g} mm has no room there; move it"
+            )
+            raise ValueError(
+                f"electrodes.positions_m[{number}] = {positions_m[number].tolist()} lies {where}: "
+                f"{step}"
+            )
+    return placed
 
 
 def _on_rectangle(sheet: Sheet, electrodes: Electrodes) -> FloatArray:
-    half = electrodes.length_m / 2
+    """Middles of the electrodes along the rim, from the lower left corner."""
     across, upright = (
-        ((np.arange(n) - (n - 1) / 2) * pitch_m)[:, None] + [-half, half]  # (n, 2), as one travels
+        (np.arange(n) - (n - 1) / 2) * pitch_m
         for n, pitch_m in zip(electrodes.each_side, electrodes.pitches_m, strict=True)
     )
-    width_m, height_m = sheet.size_m
-    w, h = width_m / 2, height_m / 2
-    sides = [
-        (across, np.full_like(across, -h)),
-        (np.full_like(upright, w), upright),
-        (-across, np.full_like(across, h)),
-        (np.full_like(upright, -w), -upright),
-    ]
-    return np.concatenate([np.stack(side, axis=-1) for side in sides])
+    w, h = sheet.size_m
+    return np.concatenate(
+        [across + w / 2, upright + w + h / 2, across + 1.5 * w + h, upright + 2 * w + 1.5 * h]
+    )
 
 
 def _on_disc(sheet: Sheet, electrodes: Electrodes) -> FloatArray:
-    n, radius = electrodes.total, sheet.width_m / 2
-    centre = np.radians(electrodes.first_angle_deg) + 2 * np.pi * np.arange(n) / n
-    half = electrodes.length_m / 2 / radius
-    angle = np.stack([centre - half, centre + half], axis=1)
-    return radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    """Middles of the electrodes along the rim, from angle 0."""
+    angle = np.radians(electrodes.first_angle_deg) + 2 * np.pi * np.arange(electrodes.total) / (
+        electrodes.total
+    )
+    return np.asarray(sheet.size_m[0] / 2 * angle)

@@ -74,8 +74,9 @@ def _as_measured(
 
 def _nodes(description: SensorDescription, matrix: FloatArray) -> IntArray | None:
     x, y = np.meshgrid(description.map_x_m, description.map_y_m)
+    on_sheet = description.on_sheet(x, y).ravel()
     goes_to = _goes_to(np.stack([x.ravel(), y.ravel()], axis=1), matrix)
-    return None if goes_to is None else np.argsort(goes_to)
+    return None if goes_to is None or (on_sheet[goes_to] != on_sheet).any() else np.argsort(goes_to)
 
 
 def _goes_to(places: FloatArray, matrix: FloatArray) -> IntArray | None:

@@ -72,7 +72,7 @@ def structure_table(ratios: str) -> str:
         (("conductivity_ratio = 100.0", ""), ["structure.response or conductivity_ratio"]),
         (("ohm_m = 10.0", "ohm_m = 1e-12"), ["contact_impedance_ohm_m = 1e-12", "check the units"]),
         (("width_m = 0.06", ""), ["sheet.width_m is missing"]),
-        (('"rectangle"', '"hexagon"'), ["sheet.shape", "hexagon", "'rectangle' or 'disc'"]),
+        (('"rectangle"', '"hexagon"'), ["sheet.shape", "hexagon", "'disc' or 'polygon'"]),
         (("height_m = 0.05", ""), ["height_m is required"]),
         (("length_m = 0.006", "length_m = 0.03"), ["length_m", "0.03", "below"]),
         (("pitch_m = 0.02", "pitch_m = 0.09"), ["pitch_m", "0.06", "two in brackets"]),

@@ -31,6 +31,7 @@ DISTURBED: Final = Flag.NOISE_HIGH | Flag.CHANNELS_SWAPPED | Flag.CHANNELS_SKEWE
 """What makes scans worthless; what the physics explains badly is what is to be taught."""
 INSIDE: Final = 0.85
 """Share of the sensing area's width that places are suggested in: an indenter has a width, too."""
+TRIES: Final = 40  # for each of the places, some of which are off the sheet
 GOLDEN: Final = 1.32471795724475
 """Root of x³ = x + 1: its powers spread points evenly over a square, however many there are
 (Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018)."""
@@ -185,11 +186,11 @@ class _Session:
 
 def suggested_mm(description: SensorDescription, number: int) -> tuple[float, float]:
     """Where to press next: any first so many of these places are spread over the skin."""
-    at = np.array([(0.5 + (number + 1) / GOLDEN) % 1, (0.5 + (number + 1) / GOLDEN**2) % 1]) - 0.5
-    frame_m = 2 * description.sheet.frame_width_m
-    size_m = np.array([description.width_m, description.height_m]) - frame_m
-    if description.sheet.shape == "disc":  # the square onto the disc, evenly
-        radius, angle = np.sqrt(at[0] + 0.5) / 2, 2 * np.pi * at[1]
-        at = radius * np.array([np.cos(angle), np.sin(angle)])
-    x_mm, y_mm = np.round(1e3 * INSIDE * size_m * at).tolist()
+    size_m = np.array([description.width_m, description.height_m])
+    margin_m = description.sheet.frame_width_m + (1 - INSIDE) / 2 * float(size_m.min())
+    step = 1 + np.arange(TRIES * (number + 1))
+    x_m, y_m = size_m[:, None] * ((0.5 + np.outer((1 / GOLDEN, 1 / GOLDEN**2), step)) % 1 - 0.5)
+    depth_m = description.sheet.outline.depth(x_m, y_m)
+    inside = np.flatnonzero(depth_m > min(margin_m, depth_m.max() / 2))
+    x_mm, y_mm = np.round(1e3 * np.array([x_m, y_m])[:, inside[number % len(inside)]]).tolist()
     return x_mm, y_mm

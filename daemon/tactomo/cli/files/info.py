@@ -182,12 +182,12 @@ def _calibration_facts(path: Path) -> dict[str, Any]:
 
 
 def _description_facts(description: SensorDescription) -> dict[str, Any]:
-    sheet = description.sheet
+    width_mm, height_mm = description.width_m * 1e3, description.height_m * 1e3
     magnitude = description.magnitude
     return {
         "name": description.name,
         "title": description.title,
-        "sheet": f"{sheet.shape}, {sheet.width_m * 1e3:g} x {description.height_m * 1e3:g} mm",
+        "sheet": f"{description.sheet.shape}, {width_mm:g} x {height_mm:g} mm",
         "electrodes": description.electrode_count,
         "voltages a scan": description.measurements,
         "pattern": str(description.pattern),

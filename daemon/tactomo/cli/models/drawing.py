@@ -131,21 +131,27 @@ def _title(description: SensorDescription, scale: float) -> str:
 def _draw_sheet(axes: Axes, description: SensorDescription, paper_mm: float) -> None:
     """The sheet in millimetres; `paper_mm` is what one of them on paper stands for."""
     import numpy as np
+    from matplotlib.patches import Circle
+    from tactomo_models.sensor.outline import Pad
 
     half_x, half_y = 5e2 * description.width_m, 5e2 * description.height_m
+    frame_m = description.sheet.frame_width_m
     _draw_outline(axes, description, 0.0, facecolor="0.88", edgecolor="black")
-    frame_mm = 1e3 * description.sheet.frame_width_m
-    line = "--" if frame_mm else "none"
-    _draw_outline(axes, description, frame_mm, facecolor="white", edgecolor="0.5", linestyle=line)
+    line = "--" if frame_m else "none"
+    _draw_outline(axes, description, frame_m, facecolor="white", edgecolor="0.5", linestyle=line)
     x, y = np.meshgrid(description.map_x_m, description.map_y_m)
     on = description.on_sheet(x, y)
     axes.plot(1e3 * x[on], 1e3 * y[on], ",", color="0.6", zorder=2)
     axes.plot(0, 0, "+", color="0.4", markersize=10, zorder=3)
     outwards = _outwards(description)
-    for number, ends in enumerate(1e3 * description.electrode_ends_m):
-        axes.plot(
-            *ends.T, color="black", linewidth=4, solid_capstyle="butt", zorder=5, clip_on=False
-        )
+    placed = zip(description.placed_electrodes, 1e3 * description.electrode_ends_m, strict=True)
+    for number, (electrode, ends) in enumerate(placed):
+        if isinstance(electrode, Pad):
+            axes.add_patch(Circle(ends.mean(axis=0), 1e3 * electrode.radius_m, color="black"))
+        else:
+            axes.plot(
+                *ends.T, color="black", linewidth=4, solid_capstyle="butt", zorder=5, clip_on=False
+            )
         label_x, label_y = ends.mean(axis=0) + 4 * paper_mm * outwards[number]
         colour, weight = ("tab:red", "bold") if number == 0 else ("black", "normal")
         axes.text(
@@ -157,27 +163,28 @@ def _draw_sheet(axes: Axes, description: SensorDescription, paper_mm: float) -> 
     axes.tick_params(pad=24, length=0, labelsize=8, colors="0.4")
 
 
-def _draw_outline(
-    axes: Axes, description: SensorDescription, inset_mm: float, **style: Any
-) -> None:
-    from matplotlib.patches import Circle, Rectangle
+def _draw_outline(axes: Axes, description: SensorDescription, inset_m: float, **style: Any) -> None:
+    import numpy as np
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path as Line
 
-    x, y = 5e2 * description.width_m - inset_mm, 5e2 * description.height_m - inset_mm
-    shape = (
-        Circle((0, 0), x, **style)
-        if description.sheet.shape == "disc"
-        else Rectangle((-x, -y), 2 * x, 2 * y, **style)
-    )
+    rings = description.sheet.outline.drawn(inset_m)
+    closed = [Line(1e3 * np.vstack([ring, ring[:1]]), closed=True) for ring in rings]
+    shape = PathPatch(Line.make_compound_path(*closed), **style)
     shape.set_clip_on(False)
     axes.add_patch(shape)
 
 
 def _outwards(description: SensorDescription) -> Any:
-    """Unit vectors (electrodes, 2) that point off the sheet."""
+    """Unit vectors (electrodes, 2) that point off the sheet; up from a pad."""
     import numpy as np
+    from tactomo_models.sensor.outline import Pad
 
-    along = np.diff(description.electrode_ends_m, axis=1)[:, 0]  # counter-clockwise
-    return np.stack([along[:, 1], -along[:, 0]], axis=1) / np.linalg.norm(along, axis=1)[:, None]
+    along = np.diff(description.electrode_ends_m, axis=1)[:, 0]
+    outwards = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    outwards /= np.linalg.norm(along, axis=1)[:, None]
+    outwards[[isinstance(each, Pad) for each in description.placed_electrodes]] = 0.0, 1.0
+    return outwards
 
 
 def _draw_pairs(axes: Axes, description: SensorDescription, outwards: Any, paper_mm: float) -> None:

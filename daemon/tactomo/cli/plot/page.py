@@ -169,14 +169,9 @@ def _draw_path(
 
 
 def _draw_sheet(axes: Any, description: SensorDescription) -> None:
-    from matplotlib.patches import Circle, Rectangle
-
     width, height = description.width_m * 1e3, description.height_m * 1e3
-    style: dict[str, Any] = {"fill": False, "edgecolor": "0.4", "linewidth": 1.5}
-    if description.sheet.shape == "disc":
-        axes.add_patch(Circle((0, 0), width / 2, **style))
-    else:
-        axes.add_patch(Rectangle((-width / 2, -height / 2), width, height, **style))
+    for ring in description.sheet.outline.drawn():
+        axes.fill(*(1e3 * ring.T), fill=False, edgecolor="0.4", linewidth=1.5)
     for number, (begin, end) in enumerate(description.electrode_ends_m * 1e3):
         axes.plot(*zip(begin, end, strict=True), color="black", linewidth=4, solid_capstyle="butt")
         x, y = (begin + end) / 2 * 1.08
