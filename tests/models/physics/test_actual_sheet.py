@@ -169,11 +169,9 @@ def test_a_skin_far_from_even_is_no_other_sensor_but_one_that_is_pressed_is_flag
     flags = {}
     for method in ("tikhonov", "fit"):  # a reference is judged by itself, and not by who uses it
         reconstructor = Reconstructor(paper, artifact, method=method, budget_s=1.0)
-        reconstructor.set_reference(
-            Reference(at_tare[Channel.MAGNITUDE], at_tare[Channel.STRUCTURE])
-        )
-        later = {str(name): volts for name, volts in far_from_even.voltages([]).items()}
-        flags[method] = reconstructor.reconstruct(**later).flags
+        reconstructor.set_reference(Reference(None, at_tare[Channel.STRUCTURE]))
+        later = far_from_even.voltages([])[Channel.STRUCTURE]
+        flags[method] = reconstructor.reconstruct(None, later).flags
     for method, found in flags.items():
         assert (Flag.REFERENCE_MISMATCH in found) == pressed, method
 
