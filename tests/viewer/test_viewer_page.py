@@ -550,12 +550,15 @@ def test_a_press_keeps_its_place_on_a_scrolled_narrow_page(page: Page) -> None:
 
 
 def test_outside_the_sheet_nothing_is_pressed(page: Page) -> None:
-    disc = {"shape": "disc", "width_mm": 100.0, "height_mm": 100.0}
-    page.skin.status["description"] = DESCRIPTION | disc
+    corners = [(-50, -50), (50, -50), (50, 0), (10, 0), (10, 50), (-50, 50)]
+    hole = [(-40, 30), (-40, 40), (-30, 40), (-30, 30)]
+    polygon = {"shape": "polygon", "width_mm": 100.0, "height_mm": 100.0}
+    page.skin.status["description"] = DESCRIPTION | polygon | {"outline_mm": [corners, hole]}
     page.open()
     wait_until(lambda: page["map"].get_attribute("data-x-mm") == "-50 50")
     page.wait_until_pressable()
-    page.click(45, 45)  # in the bounding box, not on the disc
+    page.click(30, 30)  # in the bounding box, not on the sheet
+    page.click(-35, 35)
     page.click(30, -30)
     wait_until(lambda: page.presses("release"))
     assert [round(press["x_mm"]) for press in page.presses()] == [30]

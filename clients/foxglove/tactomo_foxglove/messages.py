@@ -8,7 +8,7 @@ the sensor's description has a mount, everything is in the link's frame, on the 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, Final
 
@@ -353,11 +353,11 @@ def _disc_colour(contact: Contact, description: Mapping[str, Any], stale: str) -
 def sheet_scene(sensor: str, description: Mapping[str, Any], time_ns: int) -> fox.SceneUpdate:
     """Return the sensor itself: the sheet's outline, what can be pressed, and its electrodes."""
     white, thin = fox.Color(r=0.9, g=0.9, b=0.9, a=1.0), fox.Color(r=0.6, g=0.6, b=0.6, a=0.7)
-    width, height = float(description["width_mm"]), float(description["height_mm"])
-    lines = [_outline(description, width, height, white, 2.0)]
-    inner = description.get("sensing_width_mm"), description.get("sensing_height_mm")
-    if inner[0] and inner[1] and inner != (width, height):
-        lines.append(_outline(description, float(inner[0]), float(inner[1]), thin, 1.0))
+    width = float(description["width_mm"])
+    lines = [_line(description, ring, white, 2.0) for ring in description.get("outline_mm") or ()]
+    if description.get("sensing_outline_mm") != description.get("outline_mm"):
+        inner = description.get("sensing_outline_mm") or ()
+        lines += [_line(description, ring, thin, 1.0) for ring in inner]
     electrodes = np.array(description.get("electrodes_mm") or []).reshape(-1, 2)
     names = _points(description, electrodes * (1.0 if description.get("mount") else 1.07))
     cubes = [_electrode(_at(*point), width) for point in _points(description, electrodes).tolist()]
@@ -377,22 +377,17 @@ def sheet_scene(sensor: str, description: Mapping[str, Any], time_ns: int) -> fo
     return fox.SceneUpdate(entities=[entity])
 
 
-def _outline(
+def _line(
     description: Mapping[str, Any],
-    width_mm: float,
-    height_mm: float,
+    ring_mm: Sequence[Sequence[float]],
     colour: fox.Color,
     pixels: float,
 ) -> fox.LinePrimitive:
-    if description.get("shape") == "disc":
-        turns = np.linspace(0.0, 2.0 * np.pi, 96, endpoint=False)
-        xy = np.column_stack([np.cos(turns) * width_mm, np.sin(turns) * height_mm]) / 2
-    else:
-        side = np.linspace(-1.0, 1.0, 25 if description.get("mount") else 2)[:-1]
-        edge = np.ones_like(side)
-        sides = ((side, -edge), (edge, side), (-side, edge), (-edge, -side))
-        xy = np.concatenate([np.column_stack(each) for each in sides])
-        xy *= (width_mm / 2, height_mm / 2)
+    """Return a closed line, which follows a mounted sheet's surface."""
+    corners = np.array(ring_mm, float)
+    share = np.linspace(0.0, 1.0, 13 if description.get("mount") else 2)[:-1, None]
+    ahead = np.roll(corners, -1, axis=0) - corners
+    xy = (corners[:, None] + share * ahead[:, None]).reshape(-1, 2)
     return fox.LinePrimitive(
         type=fox.LinePrimitiveLineType.LineLoop,
         pose=fox.Pose(position=fox.Vector3(), orientation=_UPRIGHT),

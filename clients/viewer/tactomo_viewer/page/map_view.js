@@ -9,12 +9,36 @@ const OUTLINE_FINER = 3;
 const ELECTRODE_MM = [6, 2.4];  // drawn size: along the rim, across it
 const NARROW_PX = 520;     // below this the colour bar lies under the map
 
+/** The corners of a sheet's bounding box. */
+function box({ x: [x0, x1], y: [y0, y1] }) {
+  return [[x0, y0], [x1, y0], [x1, y1], [x0, y1]];
+}
+
+/** The edges of rings of corners: pairs of points. */
+function edges(rings) {
+  return rings.flatMap((ring) => ring.map((corner, i) => [corner, ring[(i + 1) % ring.length]]));
+}
+
+/** How far off a point the nearest edge is, and its direction, left of which the sheet lies. */
+function nearestEdge(rings, x, y) {
+  let [least, found] = [Infinity, [1, 0]];
+  for (const [[ax, ay], [bx, by]] of edges(rings)) {
+    const [ex, ey] = [bx - ax, by - ay];
+    const length = Math.hypot(ex, ey) || 1;
+    const share = Math.max(0, Math.min(1, ((x - ax) * ex + (y - ay) * ey) / length ** 2));
+    const off = Math.hypot(x - ax - share * ex, y - ay - share * ey);
+    if (off < least) [least, found] = [off, [ex / length, ey / length]];
+  }
+  return { off: least, along: found };
+}
+
 export class MapView {
   constructor(canvas) {
     this.canvas = canvas;
     this.context = canvas.getContext("2d");
     this.picture = document.createElement("canvas");  // the image, one pixel a node
-    this.sheet = { shape: "rectangle", x: [-75, 75], y: [-75, 75], sensing: null, electrodes: [] };
+    this.sheet = { x: [-75, 75], y: [-75, 75], electrodes: [], sensing: [] };
+    this.sheet.outline = [box(this.sheet)];
     this.tables = {};
     this.resize();
   }
@@ -23,14 +47,15 @@ export class MapView {
   describe(description) {
     const [w, h] = [description.width_mm, description.height_mm];
     if (!(w > 0 && h > 0)) return;
-    const sensing = [description.sensing_width_mm, description.sensing_height_mm];
+    const list = (given) => (Array.isArray(given) ? given : []);
     this.sheet = {
-      shape: description.shape === "disc" ? "disc" : "rectangle",
       x: [-w / 2, w / 2],
       y: [-h / 2, h / 2],
-      sensing: sensing[0] > 0 && sensing[1] > 0 ? sensing : null,
-      electrodes: Array.isArray(description.electrodes_mm) ? description.electrodes_mm : [],
+      sensing: list(description.sensing_outline_mm),
+      electrodes: list(description.electrodes_mm),
     };
+    const outline = list(description.outline_mm);
+    this.sheet.outline = outline.length ? outline : [box(this.sheet)];
     this.resize();
   }
 
@@ -73,10 +98,21 @@ export class MapView {
 
   /** Whether a point in mm lies on the sheet. */
   isOnSheet(x, y) {
-    const { shape, x: [x0, x1], y: [y0, y1] } = this.sheet;
-    return shape === "disc"
-      ? Math.hypot(x, y) <= x1
-      : x >= x0 && x <= x1 && y >= y0 && y <= y1;
+    let inside = false;
+    for (const [[ax, ay], [bx, by]] of edges(this.sheet.outline)) {
+      if (ay > y !== by > y && x < ax + ((y - ay) / (by - ay)) * (bx - ax)) inside = !inside;
+    }
+    return inside;
+  }
+
+  /** A point of the sheet, in mm: its centre, or the nearest to that which is well inside. */
+  middle() {
+    const { outline, x: [x0, x1], y: [y0, y1] } = this.sheet;
+    const clear = Math.min(x1 - x0, y1 - y0) / 10;
+    const shares = Array.from({ length: 21 }, (_, i) => i / 20);
+    const spots = shares.flatMap((sx) => shares.map((sy) => [x0 + sx * (x1 - x0), y0 + sy * (y1 - y0)]))
+      .filter((spot) => this.isOnSheet(...spot) && nearestEdge(outline, ...spot).off > clear);
+    return spots.sort((a, b) => Math.hypot(...a) - Math.hypot(...b))[0] ?? [0, 0];
   }
 
   /**
@@ -91,8 +127,8 @@ export class MapView {
     c.clearRect(0, 0, ...this.size);
     this.#axes(c);
     c.save();
-    this.#sheetPath(c);
-    c.clip();
+    this.#path(c, this.sheet.outline);
+    c.clip("evenodd");
     this.#image(c, scene);
     c.restore();
     this.#rim(c);
@@ -107,11 +143,12 @@ export class MapView {
     return (this.tables[name] ??= colourTable(name));
   }
 
-  #sheetPath(c) {
-    const { left, top, width, height } = this.plot;
+  #path(c, rings) {
     c.beginPath();
-    if (this.sheet.shape === "disc") c.arc(left + width / 2, top + height / 2, width / 2, 0, 7);
-    else c.rect(left, top, width, height);
+    for (const ring of rings) {
+      ring.forEach((corner, i) => c[i ? "lineTo" : "moveTo"](...this.mmToPixel(...corner)));
+      c.closePath();
+    }
   }
 
   #image(c, { image, frame, scale, colormap, smooth }) {
@@ -235,44 +272,36 @@ export class MapView {
   }
 
   #rim(c) {
-    const { theme, sheet, plot } = this;
-    this.#sheetPath(c);
+    const { theme, sheet } = this;
+    this.#path(c, sheet.outline);
     c.lineWidth = 1.5;
     c.strokeStyle = theme.axis;
     c.stroke();
-    if (sheet.sensing) {
-      const [w, h] = sheet.sensing.map((size) => size * plot.scale);
-      c.beginPath();
-      if (sheet.shape === "disc") c.arc(...this.mmToPixel(0, 0), w / 2, 0, 7);
-      else c.rect(plot.left + (plot.width - w) / 2, plot.top + (plot.height - h) / 2, w, h);
-      c.setLineDash([2, 5]);
-      c.lineWidth = 1;
-      c.strokeStyle = "rgba(255, 255, 255, 0.4)";
-      c.stroke();
-      c.setLineDash([]);
-    }
+    this.#path(c, sheet.sensing);
+    c.setLineDash([2, 5]);
+    c.lineWidth = 1;
+    c.strokeStyle = "rgba(255, 255, 255, 0.4)";
+    c.stroke();
+    c.setLineDash([]);
     sheet.electrodes.forEach(([x, y], i) => this.#electrode(c, x, y, i));
   }
 
-  // A bar on the rim, along the side on which it lies, and its number inside.
+  // A bar along the edge of the outline that is nearest, and its number inside.
   #electrode(c, x, y, i) {
-    const { sheet: { shape, x: [, x1], y: [, y1] }, plot } = this;
-    const onSide = Math.abs(x) / x1 > Math.abs(y) / y1;
+    const { sheet, plot } = this;
+    const [dx, dy] = nearestEdge(sheet.outline, x, y).along;
     if (!plot.narrow) {
-      const inwards = 1 - 13 / (plot.scale * Math.hypot(x, y));
-      const at = shape === "disc" ? [x * inwards, y * inwards]
-        : onSide ? [x - (Math.sign(x) * 13) / plot.scale, y] : [x, y - (Math.sign(y) * 12) / plot.scale];
+      const at = [x - (dy * 13) / plot.scale, y + (dx * 13) / plot.scale];
       c.font = `10px ${this.theme.font}`;
       c.fillStyle = "rgba(255, 255, 255, 0.55)";
       c.textAlign = "center";
       c.textBaseline = "middle";
       c.fillText(String(i), ...this.mmToPixel(...at));
     }
-    const angle = shape === "disc" ? Math.PI / 2 - Math.atan2(y, x) : onSide ? Math.PI / 2 : 0;
     const [along, across] = ELECTRODE_MM.map((mm) => mm * plot.scale);
     c.save();
     c.translate(...this.mmToPixel(x, y));
-    c.rotate(angle);
+    c.rotate(-Math.atan2(dy, dx));
     c.beginPath();
     c.roundRect(-along / 2, -across / 2, along, across, across / 2);
     c.fillStyle = this.theme.electrode;

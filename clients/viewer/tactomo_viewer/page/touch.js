@@ -75,7 +75,7 @@ export class Touch {
 
   /** Press by program: `pointer` names what presses, `indenter` is {pressure, size, shape}. */
   place(pointer, point, indenter) {
-    if (!this.enabled) return;
+    if (!this.enabled || !this.view.isOnSheet(...point)) return;
     const press = this.down.get(pointer);
     const rests = press?.x === point[0] && press.y === point[1] && press.pressure === indenter.pressure;
     if (!press) this.#start(pointer, point, indenter);
@@ -121,13 +121,13 @@ export class Touch {
       ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step],
     }[event.key];
     if (by) {
-      const [x, y] = this.cursor ?? [0, 0];
+      const [x, y] = this.cursor ?? this.view.middle();
       const next = [x + by[0], y + by[1]];
       if (this.view.isOnSheet(...next)) this.cursor = next;
       const press = this.down.get("keyboard");
       if (press && this.cursor) this.#move(press, this.cursor);
     } else if (event.key === " ") {
-      this.cursor ??= [0, 0];
+      this.cursor ??= this.view.middle();
       if (!this.down.has("keyboard")) this.#start("keyboard", this.cursor);
     } else if (event.key === "Escape") {
       this.#releaseAll();
