@@ -13,6 +13,7 @@ from typing import Final
 
 from tactomo_models import Reference
 
+from tactomo.imaging.kept_reference import KnownSkin
 from tactomo.recordings.active_recording import ActiveRecording
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording_writer import calibration_entry, mark_entry, reference_entry
@@ -27,8 +28,7 @@ REPEAT_S: Final = 60.0
 class InForce:
     """What a frame is made with, beside the frames before it."""
 
-    reference: Reference | None  # what changes are measured against; None before the first tare
-    taken_ns: int  # when that was taken, nanoseconds since 1970
+    rest: KnownSkin | None  # what changes are measured against; None before the first tare
     method: str
     budget_ms: float | None  # of modelled work; None for the method's own
     calibration: str  # the text of the pressure calibration; empty for the description's curve
@@ -78,14 +78,15 @@ class FrameMarks:
 
     def _tell(self, recording: ActiveRecording, in_force: InForce) -> None:
         """Say reference and calibration, where they are new to the recording, or now and then."""
-        reference, now_ns = in_force.reference, time.monotonic_ns()
+        rest, now_ns = in_force.rest, time.monotonic_ns()
+        reference = None if rest is None else rest.reference
         is_due, is_new = time.monotonic() >= self._repeat_s, reference is not self._reference
         self._reference = reference
         recording.references += is_new
-        if reference is not None and (is_new or is_due):
+        if rest is not None and (is_new or is_due):
             self._repeat_s = time.monotonic() + REPEAT_S
             number = recording.references
-            recording.add(reference_entry(reference, number, now_ns, in_force.taken_ns))
+            recording.add(reference_entry(rest.reference, number, now_ns, rest.realtime_ns))
         text = in_force.calibration
         is_new, self._calibration = text != self._calibration, text
         recording.calibrations += is_new

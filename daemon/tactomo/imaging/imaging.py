@@ -1,13 +1,13 @@
 """One dual scan to one frame: check, reconstruct, publish, and mark it in the recording.
 
-For use by the pipeline thread; nothing in here waits. What others may read (`reference`, `stages`,
+For use by the pipeline thread; nothing in here waits. What others may read (`rest`, `stages`,
 ...) is written by that thread alone.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import structlog
@@ -46,6 +46,14 @@ from tactomo.timing import Durations, Rate, wall_clock_ns
 log = structlog.get_logger()
 
 
+@dataclass(frozen=True)
+class Doubt:
+    """Why frames are flagged `reference_disputed`: something may have lain on the tared skin."""
+
+    ends_at_rest: bool = False  # whether a quiet frame ends it: an older reference is in force
+    before: KnownSkin | None = None  # by which the skin may be at rest: that of before the tare
+
+
 class Imaging:
     """Reconstructs dual scans against the reference in force, and publishes the frames."""
 
@@ -66,9 +74,8 @@ class Imaging:
         publisher: Publisher,  # gets the frames
         on_event: OnEvent,  # told what people should know
     ) -> None:
-        # what changes are measured against; None before the first tare
-        self.reference: Reference | None = None
-        self.reference_realtime_ns = 0  # when it was taken
+        # what changes are measured against, and since when; None before the first tare
+        self.rest: KnownSkin | None = None
         self.stages: dict[str, Durations] = {}  # how long each stage takes
         self.frame_rate = Rate()  # how often a frame is published
         self.acquired_monotonic_ns = 0  # when the newest dual scan was acquired; 0 before the first
@@ -96,10 +103,7 @@ class Imaging:
         )
         self._frozen = FrozenConverters(on_event)
         self._kept = kept
-        self._is_disputed = False  # the skin at the start was not as the reference in force has it
-        self._is_unchecked = False  # what lay on it when the reference in force was taken
-        # the one before a tare under contacts, and when it was taken: at rest by it is at rest
-        self._before: KnownSkin | None = None
+        self._doubt: Doubt | None = None  # about the reference in force
         self._recorder = recorder
         self._publisher = publisher
         self._on_event = on_event
@@ -122,8 +126,17 @@ class Imaging:
     @property
     def in_force(self) -> InForce:
         """What the next frame is made with."""
-        taken_ns, effort = self.reference_realtime_ns, self.method.effective
-        return InForce(self.reference, taken_ns, *effort, self.calibration.text)
+        return InForce(self.rest, *self.method.effective, self.calibration.text)
+
+    @property
+    def reference(self) -> Reference | None:
+        """What changes are measured against; None before the first tare."""
+        return None if self.rest is None else self.rest.reference
+
+    @property
+    def taken_ns(self) -> int:
+        """When the reference was taken, nanoseconds since 1970; 0 before the first tare."""
+        return 0 if self.rest is None else self.rest.realtime_ns
 
     def has_reference(self, channel: Channel) -> bool:
         """Whether there is something to measure this channel's changes against."""
@@ -138,9 +151,8 @@ class Imaging:
         self._use(self._reconstructor.take(as_it_is), realtime_ns)
 
     def _use(self, tare: Tare, realtime_ns: int) -> None:
-        self.reference_realtime_ns = realtime_ns
         (self._reconstructor.use if self._tracker is None else self._tracker.begin)(tare)
-        self._note_reference(tare.reference)
+        self._note_reference(KnownSkin(tare.reference, realtime_ns))
 
     def _take(self, tare: Tare, is_asked: bool, contacts: int) -> bool:
         """Use a reference that was taken; at the start only if nothing lies on the skin.
@@ -161,12 +173,10 @@ class Imaging:
                     f"neither contacts nor drift explain how the skin differs from {known.words}",
                     "if something lies on it, take it off; then `tactomo tare`",
                 )
-        self._is_disputed = False
         is_first = not is_asked and self.reference is None
-        self._is_unchecked = contacts > 0 or (
-            is_first and self._kept is not None and self._kept.is_unreadable
-        )
-        self._before = self._known_before() if contacts else None
+        is_unreadable = is_first and self._kept is not None and self._kept.is_unreadable
+        before = self._known_before() if contacts else None
+        self._doubt = Doubt(before=before) if contacts or is_unreadable else None
         self._use(tare, wall_clock_ns())
         if contacts:
             self._on_event(
@@ -174,15 +184,17 @@ class Imaging:
                 f"the reference was taken while {contacts} contact(s) were shown",
                 "take everything off the skin; if contacts are still shown then: `tactomo tare`",
             )
-        elif self._kept is not None and not self._is_unchecked:
+        elif self._kept is not None and self._doubt is None:
             self._kept.keep(reference, self.calibration.device_ids)
         return True
 
     def _known_before(self) -> KnownSkin | None:
         """The newest reference that was taken while nothing was shown."""
-        if self._before is not None or self.reference is None:
-            return self._before
-        return KnownSkin(self.reference.taken_as_it_is(), self.reference_realtime_ns)
+        if self._doubt is not None and self._doubt.before is not None:
+            return self._doubt.before
+        if self.rest is None:
+            return None
+        return replace(self.rest, reference=self.rest.reference.taken_as_it_is())
 
     def _fall_back(self, why: str) -> bool:
         """Use the reference that is kept, since none can be taken; returns whether there is one."""
@@ -195,7 +207,7 @@ class Imaging:
         return None if self._kept is None else self._kept.read(self.calibration.device_ids)
 
     def _prefer(self, known: KnownSkin, why: str) -> None:
-        self._is_disputed = True
+        self._doubt = Doubt(ends_at_rest=True)
         self.use_reference(known.reference, known.realtime_ns)
         self._on_event(
             "reference_disputed",
@@ -203,10 +215,10 @@ class Imaging:
             "take everything off the skin; if contacts are still shown then: `tactomo tare`",
         )
 
-    def _note_reference(self, reference: Reference) -> None:
+    def _note_reference(self, rest: KnownSkin) -> None:
         """Say that this reference is in force."""
-        self.reference = reference
-        self.calibration.meet_skin(reference)
+        self.rest = rest
+        self.calibration.meet_skin(rest.reference)
         self.taring.note_reference()
 
     def forget(self) -> None:
@@ -239,14 +251,13 @@ class Imaging:
         volts = {scan.channel: scan.volts for scan in dual.scans}
         self._publish_scan(dual, timing, volts)
         volts = self._frozen.without(volts, self.reference)
-        if self._before is not None and is_at_rest(volts, self._before.reference):
-            self._restore(self._before)
+        before = None if self._doubt is None else self._doubt.before
+        if before is not None and is_at_rest(volts, before.reference):
+            self._restore(before)
         clipped = [scan.channel for scan in dual.scans if scan.flags & ScanFlag.SATURATED]
         frame = self._reconstruct(volts, clipped, is_exact=mark is not None)
-        if frame is not None and self._is_disputed:
-            frame = self._judge_dispute(frame)
-        elif frame is not None and self._is_unchecked:
-            frame = replace(frame, flags=frame.flags | Flag.REFERENCE_DISPUTED)
+        if frame is not None and self._doubt is not None:
+            frame = self._doubted(frame, self._doubt)
         self._marks.mark(dual, timing, self.in_force)  # first: what was seen is recorded
         if frame is not None:
             self._contacts = len(frame.contacts)
@@ -277,10 +288,11 @@ class Imaging:
         elif share == 1:
             self._on_event("processor_free", "frames get all of their time")
 
-    def _judge_dispute(self, frame: Reconstruction) -> Reconstruction:
-        """Flag a frame, unless it settles the dispute: the skin is again as it was known."""
-        if frame.tier == "quiet" and TOUCHES_SEEN.issuperset(frame.flags.names()):
-            self._is_disputed = False
+    def _doubted(self, frame: Reconstruction, doubt: Doubt) -> Reconstruction:
+        """Flag a frame, unless it ends the doubt: the skin is again as it was known."""
+        is_at_rest = frame.tier == "quiet" and TOUCHES_SEEN.issuperset(frame.flags.names())
+        if doubt.ends_at_rest and is_at_rest:
+            self._doubt = None
             detail = "the skin is at rest by the reference that was kept"
             self._on_event("reference_confirmed", detail)
             return frame
@@ -288,7 +300,7 @@ class Imaging:
 
     def _restore(self, known: KnownSkin) -> None:
         """Settle the dispute about a tare: the skin is at rest by the reference before it."""
-        self._before, self._is_unchecked = None, False
+        self._doubt = None
         self.use_reference(known.reference, known.realtime_ns)
         self._on_event(
             "reference_confirmed",
@@ -304,9 +316,8 @@ class Imaging:
             self._reconstructor.forget_shape()
         self.calibration.obey(mark.calibration)
         if mark.reference is not None and mark.reference is not self.reference:
-            self.reference_realtime_ns = wall_clock_ns()
             self._reconstructor.set_reference(mark.reference)
-            self._note_reference(mark.reference)
+            self._note_reference(KnownSkin(mark.reference, wall_clock_ns()))
 
     def _reconstruct(
         self, volts: Volts, saturated: list[Channel], *, is_exact: bool
@@ -343,8 +354,8 @@ class Imaging:
     def _follow(self, tracker: BaselineTracker) -> None:
         """Take over the reference that the tracker has put in force, and tell where it refuses."""
         if tracker.reference is not None and tracker.reference is not self.reference:
-            self._note_reference(tracker.reference)
-            if self._kept is not None and not self._is_unchecked:
+            self._note_reference(KnownSkin(tracker.reference, self.taken_ns))
+            if self._kept is not None and (self._doubt is None or self._doubt.ends_at_rest):
                 self._kept.follow(tracker.reference, self.calibration.device_ids)
         if tracker.refusal:
             self._on_event(

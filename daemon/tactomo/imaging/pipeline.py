@@ -221,9 +221,9 @@ class Pipeline(Worker):
             self._ready.extend(ready if self._takes_all else self._newest(ready))
             while self._ready and not self._stopping.is_set() and self._is_let_through():
                 self.turns += 1
-                taken_ns = self._imaging.reference_realtime_ns
+                taken_ns = self._imaging.taken_ns
                 self._process(self._ready.popleft())
-                if self._imaging.reference_realtime_ns != taken_ns:
+                if self._imaging.taken_ns != taken_ns:
                     self._is_excused = True
                 self._obey_commands()
             self._obey_commands()

@@ -65,7 +65,7 @@ class Status:
     def _fields(self, latency: Durations, subscribers: int) -> dict[str, Any]:
         pipeline, imaging = self._pipeline, self._imaging
         active = self._recorder.active
-        reference, taught = imaging.reference, imaging.calibration.taught
+        rest, taught = imaging.rest, imaging.calibration.taught
         stages = {stage: times.percentiles_ms() for stage, times in imaging.stages.items()}
         losses = {
             "frames": imaging.frame_rate.count,
@@ -95,8 +95,8 @@ class Status:
                 "jumps": pipeline.wall_clock.jumps,
                 "last_jump_s": pipeline.wall_clock.last_jump_s,
             },
-            "reference": reference
-            and {"scans": reference.scans, "taken_realtime_ns": imaging.reference_realtime_ns},
+            "reference": rest
+            and {"scans": rest.reference.scans, "taken_realtime_ns": rest.realtime_ns},
             "baseline": imaging.baseline,
             "stage_ms": {stage: times for stage, times in stages.items() if times},
             "latency_ms": latency.percentiles_ms(),

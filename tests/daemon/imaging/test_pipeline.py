@@ -29,7 +29,7 @@ class Frames:
     def __init__(self) -> None:
         self.counters: list[int] = []
         self.go = threading.Event()
-        self.reference_realtime_ns = 0
+        self.taken_ns = 0
         self.taring = SimpleNamespace(start=nothing, check=nothing, close=nothing)
         self.calibration = SimpleNamespace(meet=lambda _: None)
 
