@@ -7,6 +7,7 @@ socket that notes what it is asked; between them and the browser is the viewer, 
 from __future__ import annotations
 
 import asyncio
+import io
 import json
 import re
 import threading
@@ -22,6 +23,7 @@ import numpy as np
 import pytest
 from aiohttp import web
 from fake_control import FakeControl
+from PIL import Image as Picture
 from selenium import webdriver
 from selenium.webdriver import Keys
 from selenium.webdriver.common.by import By
@@ -284,6 +286,68 @@ def test_a_press_is_bright_where_it_is(page: Page, smooth: bool) -> None:
     wait_until(lambda: sum(page.colour(30, -48)) > 350)
     for x_mm, y_mm in ((-36, -48), (36, 48), (-36, 48), (0, 0), (36, -26), (58, -48)):
         assert sum(page.colour(x_mm, y_mm)) < 60, (x_mm, y_mm)
+
+
+def around(radius_m: float) -> dict[str, Any]:
+    """A mount around a cylinder, as a status has it."""
+    angles = np.linspace(-0.075, 0.075, 25) / radius_m
+    rows = [
+        [[radius_m * np.cos(a), radius_m * np.sin(a), y] for a in angles.tolist()]
+        for y in np.linspace(-0.075, 0.075, 25).tolist()
+    ]
+    return {"frame": "left_forearm_link", "kind": "cylinder", "surface_m": rows}
+
+
+SEEN = "return tactomo.surface.mmToPixel(arguments[0], arguments[1])"
+
+
+def test_a_mounted_sheet_is_pressed_and_turned_on_its_surface(page: Page) -> None:
+    page.skin.status = page.skin.status | {"description": {**DESCRIPTION, "mount": around(0.04)}}
+    page.skin.press(-15, 20)
+    page.skin.contacts = [
+        replace(
+            page.skin.contacts[0],
+            position_m=(0.037, -0.0146, 0.02),
+            normal=(0.93, -0.366, 0.0),
+            frame="left_forearm_link",
+        )
+    ]
+    page.open()
+    wait_until(lambda: page.js("return Boolean(tactomo.surface?.mesh)"))
+    page.wait_until_pressable()
+    assert "left_forearm_link" in page["surface-help"].text
+
+    def bright() -> bool:
+        x, y = page.js(SEEN, -20, 24)
+        picture = Picture.open(io.BytesIO(page["surface"].screenshot_as_png)).convert("RGB")
+        return sum(picture.getpixel((round(x), round(y)))) > 250  # type: ignore[arg-type]
+
+    wait_until(bright)
+
+    def mouse(kind: str, x: float, y: float) -> None:
+        box = page.js("return document.getElementById('surface').getBoundingClientRect()")
+        button = {"button": "left", "buttons": int(kind != "Released"), "clickCount": 1}
+        at = {"x": round(box["left"] + x), "y": round(box["top"] + y)}
+        page.browser.execute_cdp_cmd(
+            "Input.dispatchMouseEvent", {"type": f"mouse{kind}"} | at | button
+        )
+
+    x, y = page.js(SEEN, 10, -30)
+    mouse("Pressed", x, y)
+    wait_until(lambda: bool(page.presses()))
+    press = page.presses()[-1]
+    assert (press["x_mm"], press["y_mm"]) == pytest.approx((10, -30), abs=1)
+    mouse("Released", x, y)
+    wait_until(lambda: bool(page.presses("release")))
+    pressed = len(page.presses())
+    left = page.js(SEEN, -40, -30)[0]
+    mouse("Pressed", 5, 5)  # beside the sheet
+    mouse("Moved", 105, 5)
+    mouse("Released", 105, 5)
+    wait_until(lambda: page.js(SEEN, -40, -30)[0] > left + 10)
+    assert len(page.presses()) == pressed
+    page.skin.status = page.skin.status | {"description": DESCRIPTION}
+    wait_until(lambda: not page["surface"].is_displayed())
 
 
 @pytest.mark.parametrize(("ix", "iy"), [(47, 5), (3, 45)])

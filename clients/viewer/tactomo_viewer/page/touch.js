@@ -7,7 +7,10 @@ const TRAIL = 200;  // places of a press that are remembered
 const isSomebodys = (pointer) => typeof pointer === "number" || pointer === "keyboard";
 
 export class Touch {
-  /** `indenter()` says with what is pressed: {pressure, size, shape}; `onPress(press)` hears of new ones. */
+  /**
+   * `view` is what is pressed, see `add`. `indenter()` says with what: {pressure, size, shape};
+   * `onPress(press)` hears of new ones.
+   */
   constructor({ view, link, indenter, onChange, onPress }) {
     Object.assign(this, { view, link, indenter, onChange, onPress });
     this.enabled = false;
@@ -16,12 +19,9 @@ export class Touch {
     this.down = new Map();  // pointer (or "keyboard") -> press
     this.cursor = null;
     this.count = 0;
+    this.canvases = [];
+    this.add(view);
     const { canvas } = view;
-    canvas.addEventListener("pointerdown", (event) => this.#pointerDown(event));
-    canvas.addEventListener("pointermove", (event) => this.#pointerMove(event));
-    for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) {
-      canvas.addEventListener(name, (event) => this.#release(event.pointerId, this.hold || event.shiftKey));
-    }
     canvas.addEventListener("keydown", (event) => this.#keyDown(event));
     canvas.addEventListener("keyup", (event) => {
       if (event.key === " ") this.#release("keyboard", this.hold || event.shiftKey);
@@ -34,6 +34,18 @@ export class Touch {
     document.addEventListener("visibilitychange", () => {
       if (document.hidden) this.#releaseAll();
     });
+  }
+
+  /** Press on a view, too: on its canvas, where its `pixelToMm` finds the sheet. */
+  add(view) {
+    const { canvas } = view;
+    this.canvases.push(canvas);
+    canvas.classList.toggle("pressable", this.enabled);
+    canvas.addEventListener("pointerdown", (event) => this.#pointerDown(event, view));
+    canvas.addEventListener("pointermove", (event) => this.#pointerMove(event, view));
+    for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) {
+      canvas.addEventListener(name, (event) => this.#release(event.pointerId, this.hold || event.shiftKey));
+    }
     canvas.addEventListener("contextmenu", (event) => {
       if (this.down.size) event.preventDefault();  // a long touch is a press, not a menu
     });
@@ -48,7 +60,7 @@ export class Touch {
   enable(enabled) {
     if (enabled === this.enabled) return;
     this.enabled = enabled;
-    this.view.canvas.classList.toggle("pressable", enabled);
+    for (const canvas of this.canvases) canvas.classList.toggle("pressable", enabled);
     this.view.canvas.role = enabled ? "application" : "img";
     if (!enabled) {
       this.down.clear();
@@ -99,19 +111,19 @@ export class Touch {
     }
   }
 
-  #pointerDown(event) {
-    const point = this.#point(event);
+  #pointerDown(event, view) {
+    const point = this.#point(event, view);
     if (!this.enabled || event.button !== 0 || !this.view.isOnSheet(...point)) return;
     event.preventDefault();
-    this.view.canvas.focus({ preventScroll: true, focusVisible: false });
+    view.canvas.focus({ preventScroll: true, focusVisible: false });
     this.cursor = null;
-    this.view.canvas.setPointerCapture(event.pointerId);
+    view.canvas.setPointerCapture(event.pointerId);
     this.#start(event.pointerId, point);
   }
 
-  #pointerMove(event) {
+  #pointerMove(event, view) {
     const press = this.down.get(event.pointerId);
-    if (press) this.#move(press, this.#point(event));
+    if (press) this.#move(press, this.#point(event, view));
   }
 
   #keyDown(event) {
@@ -138,9 +150,9 @@ export class Touch {
     this.onChange();
   }
 
-  #point({ clientX, clientY }) {
-    const box = this.view.canvas.getBoundingClientRect();
-    return this.view.pixelToMm(clientX - box.left, clientY - box.top);
+  #point({ clientX, clientY }, view) {
+    const box = view.canvas.getBoundingClientRect();
+    return view.pixelToMm(clientX - box.left, clientY - box.top);
   }
 
   #start(pointer, [x, y], indenter = this.indenter()) {

@@ -39,6 +39,7 @@ const touch = new Touch({
     redraw();
   },
   onPress: (press) => {
+    idle.stop();
     if (!contactNear(press)) state.awaited = { ...press, at: performance.now() };
   },
 });
@@ -109,6 +110,36 @@ function onLink() {
   refresh();
 }
 
+let surface = null;         // the view of a mounted sheet on its surface, once there is one
+let mounted = "";
+
+// What draws surfaces is loaded by those who have one.
+async function showMount(mount) {
+  const key = JSON.stringify(mount ?? null);
+  if (key === mounted) return;
+  mounted = key;
+  const room = byId("surface-room");
+  room.hidden = !mount;
+  room.parentElement.classList.toggle("mounted", Boolean(mount));
+  view.resize();
+  if (!mount) return;
+  const turn = "drag beside it to turn it";
+  try {
+    const { SurfaceView } = await import("./surface_view.js");
+    if (!surface) {
+      surface = new SurfaceView(byId("surface"), view, redraw);
+      touch.add(surface);
+      window.tactomo.surface = surface;
+    }
+    surface.describe(mount);
+    surface.resize();
+    setText(byId("surface-help"), `${mount.frame}: ${turn}`);
+  } catch (error) {
+    setText(byId("surface-help"), `The surface cannot be drawn: ${error.message} Turn on WebGL in this browser.`);
+  }
+  redraw();
+}
+
 let described = "";
 
 function describe(description) {
@@ -116,6 +147,7 @@ function describe(description) {
   if (key === described || !description) return;
   described = key;
   view.describe(description);
+  showMount(description.mount);
   byId("pressure").max = Math.max(300, description.pressure_max_kpa ?? 0);
   const hasPressure = description.pressure_max_kpa !== null;
   if (!hasPressure) choose("unit", "percent");
@@ -140,7 +172,7 @@ function draw() {
   const frame = shownFrame();
   const unit = chosen("unit");
   const image = imageIn(frame, unit);
-  view.draw({
+  const scene = {
     frame,
     image,
     scale: image ? scaleTop(image, unit) : 1,
@@ -151,7 +183,9 @@ function draw() {
     outline: byId("outline").checked,
     presses: touch.presses,
     cursor: touch.cursor,
-  });
+  };
+  view.draw(scene);
+  if (!byId("surface-room").hidden) surface?.draw(scene);
   if (frame === state.drawn) return;
   state.drawn = frame;
   showReadout();
@@ -227,7 +261,7 @@ function refresh() {
   const found = past && live?.level !== "error" ? pausedBanner(past, now) : live;
   showBanner(found);
   state.isCurrent = past !== null || isMapCurrent(found);
-  byId("map").classList.toggle("stale", !state.isCurrent);
+  for (const id of ["map", "surface"]) byId(id).classList.toggle("stale", !state.isCurrent);
   document.body.dataset.health = found?.name ?? (state.status ? "good" : "connecting");
   const linked = isHeard(state, now);
   if (linked) showState(["stale", "ended"].includes(live?.name) ? live.name : state.status.fields.state);
@@ -429,7 +463,7 @@ function readout(x, y) {
   return Number.isFinite(value) ? `${place}: ${fixed(value, decimals)} ${name}` : place;
 }
 
-new ResizeObserver(() => { view.resize(); redraw(); }).observe(byId("map").parentElement);
+new ResizeObserver(() => { view.resize(); surface?.resize(); redraw(); }).observe(byId("map").parentElement);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 setInterval(refresh, PANEL_MS);
 showIndenter();
