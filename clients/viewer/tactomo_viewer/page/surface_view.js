@@ -13,6 +13,7 @@ const LEAST_ARROW = 0.12;
 const FULL_FORCE_N = 100;       // a firm push of a hand; larger forces have the largest arrow
 const LIFT = 0.004;             // of the radius: what lies on the surface is not hidden by it
 const RING_POINTS = 48;
+const EDGE_STEPS = 24;          // of an edge of the outline, which follows the surface
 const TURN_PER_PX = 0.008;      // radians
 
 export class SurfaceView {
@@ -190,12 +191,15 @@ export class SurfaceView {
   }
 
   #rim(colour) {
-    if (this.flat.sheet.shape !== "rectangle") return;
-    const steps = Array.from({ length: RING_POINTS }, (_, i) => i / RING_POINTS);
-    const sides = [(t) => [t, 0], (t) => [1, t], (t) => [1 - t, 1], (t) => [0, 1 - t]];
-    const points = sides.flatMap((side) => steps.map((t) => this.#at(...side(t))));
-    const geometry = new THREE.BufferGeometry().setFromPoints(points);
-    this.marks.add(new THREE.LineLoop(geometry, new THREE.LineBasicMaterial({ color: colour })));
+    const steps = Array.from({ length: EDGE_STEPS }, (_, i) => i / EDGE_STEPS);
+    for (const ring of this.flat.sheet.outline) {
+      const points = ring.flatMap(([ax, ay], corner) => {
+        const [bx, by] = ring[(corner + 1) % ring.length];
+        return steps.map((t) => this.#place(ax + t * (bx - ax), ay + t * (by - ay)));
+      });
+      const geometry = new THREE.BufferGeometry().setFromPoints(points);
+      this.marks.add(new THREE.LineLoop(geometry, new THREE.LineBasicMaterial({ color: colour })));
+    }
   }
 
   #electrodes(colour) {
