@@ -28,6 +28,7 @@ from tactomo_models.physics.artifact import Artifact
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scans.reference import Reference
+from tactomo_models.scans.repeats import Repeats, is_noisy
 from tactomo_models.scans.tare import Tare
 from tactomo_models.scene.areas import Areas
 from tactomo_models.scene.contacts import contacts_of, mounted, pressure_map, total_force
@@ -85,6 +86,8 @@ class Reconstructor:
         self.artifact = skin.artifact
         self._skin = replace(skin, regularisation=description.instrument.regularisation)
         self._tare = skin.tare
+        self._repeats = Repeats(description.pairs)
+        self._last: dict[Channel, FloatArray] = {}  # scan of each channel
         self._methods: dict[str, Method] = {}  # by their names, once they were asked for
         self._failures: dict[str, str] = {}  # of methods prepared since the tare; empty if good
         self._previous: Estimate | None = None
@@ -210,7 +213,20 @@ class Reconstructor:
             self._tare = self._tare.with_noise_of(magnitude, structure)
             if self._tare.channels is not self._skin.tare.channels:
                 self._prepare()
+        magnitude = self._measured(Channel.MAGNITUDE, magnitude)
+        structure = self._measured(Channel.STRUCTURE, structure)
         return self._tare.changes(magnitude, structure, saturated)
+
+    def _measured(self, channel: Channel, scan: FloatArray | None) -> FloatArray | None:
+        """A scan less the drives and pairs that repeat the last one; all of it may come again."""
+        last = self._last.get(channel)
+        if scan is None or scan.shape != (self.description.measurements,):
+            return scan
+        self._last[channel] = scan
+        if last is None or not is_noisy(self._tare.reference, channel, scan):
+            return scan
+        parts, repeated = self._repeats.find(scan, last)
+        return np.where(repeated, np.nan, scan) if parts else scan
 
     def solve(self, measurement: Measurement) -> Reconstruction:
         """The second half of `reconstruct`: what follows from a measurement."""
@@ -313,6 +329,9 @@ class Reconstructor:
                 misfit = max(each.misfit for each in changes.values())
                 if misfit > BAD_MISFIT:
                     flags |= Flag.MISFIT_HIGH
+            tells = Channel.STRUCTURE if Channel.STRUCTURE in changes else Channel.MAGNITUDE
+            if changes[tells].hides:
+                flags |= Flag.NOISE_HIGH
         blank = self._image(np.zeros((self.description.map.nodes_y, self.description.map.nodes_x)))
         magnitude = blank if Channel.MAGNITUDE in changes else None
         return Reconstruction(

@@ -101,7 +101,7 @@ class Imaging:
             self._fall_back,
             on_event,
         )
-        self._frozen = FrozenConverters(on_event)
+        self._frozen = FrozenConverters(description.pairs, on_event)
         self._kept = kept
         self._doubt: Doubt | None = None  # about the reference in force
         self._recorder = recorder

@@ -59,6 +59,9 @@ class Changes:
     # it; of a quiet scan nobody asks
     factor: float = 1.0
     signal_beyond_factor: float = np.inf
+    # whether the scan is quiet only because it is noisy: a press that the tare's noise would have
+    # shown half of the time may be in it
+    hides: bool = False
 
     @property
     def is_factor(self) -> bool:

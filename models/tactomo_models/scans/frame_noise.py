@@ -18,6 +18,7 @@ from tactomo_models.robust import HUBER_EFFICIENCY, huber_sigma
 from tactomo_models.scans.plausibility import TINY, Wiring, asymmetry_of
 
 FALSE_ALARM = 1e-6  # chance that an unpressed frame of pure noise is taken for a pressed one
+CERTAIN = 1.645  # standard deviations that 95 % of a normal distribution are below
 
 
 class FrameNoise(NamedTuple):
@@ -60,6 +61,19 @@ class FrameNoiseEstimator:
         ratio = huber_sigma(error / self._sigma[both]) ** 2
         is_chance = ratio * freedom < noise_limit(freedom)
         return AS_TARED if is_chance and not self._is_bound else FrameNoise(ratio, freedom)
+
+
+def hides_press(
+    squares: float,  # sum over the independent ways in which pressing changes voltages
+    ways: int,  # how many these are
+    variance: float,  # of one of them by the scan's noise; by the tare's it is 1
+    freedom: float,  # degrees of freedom that this variance is known with
+    told: float,  # sum of squares that a press adds which is told half of the time after the tare
+) -> bool:
+    """Tell whether such a press may be in a scan: whether it would leave more in 95 of 100."""
+    by_noise = 2 * ways * variance**2 + 2 * (ways * variance) ** 2 / freedom
+    spread = np.sqrt(by_noise + 4 * told * variance)
+    return bool(squares > ways * variance + told - CERTAIN * spread)
 
 
 @cache

@@ -110,6 +110,9 @@ class Wiring:
         ends = np.hstack([pairs.drive, pairs.measure])
         self.electrodes = (ends == np.arange(electrodes)[:, None, None]).any(axis=2)
         self.ordered = ~_cross(pairs.drive, pairs.measure)
+        self.drives = np.array(
+            [(pairs.drive == p).all(axis=1) for p in np.unique(pairs.drive, axis=0)]
+        )
         driven = np.unique(np.concatenate([pairs.drive, pairs.measure]), axis=0)
         self.pairs = np.array(
             [(pairs.drive == p).all(axis=1) | (pairs.measure == p).all(axis=1) for p in driven]
@@ -192,7 +195,7 @@ class ScanCheck:
     ) -> Verdict:
         """Say what is wrong with a scan."""
         high_noise = 10.0  # times what the tare saw: interference
-        size = np.abs(scan)
+        size = read = np.abs(scan)
         usable = self._usable & (size <= self._limit)
         flags = Flag(0)
         wrong = usable ^ self._usable
@@ -211,8 +214,9 @@ class ScanCheck:
             flags |= Flag.NOISE_HIGH
         along = scan * self._sign
         outlier = unequal | (along < self._wrong_way * noise)
-        if outlier.any():
-            along = np.where(outlier, self._size, along)
+        not_to_go_by = outlier | ~usable
+        if not_to_go_by.any():
+            along = np.where(not_to_go_by, self._size, along)
         silent = self._pairs @ along < self._silence
         if silent.any():
             outlier |= self._wiring.pairs[silent].any(axis=0)
@@ -220,6 +224,10 @@ class ScanCheck:
         wrong |= outlier
         if suspect is not None:
             wrong |= suspect
+        if (unread := self._usable & ~np.isfinite(read)).any():
+            # A drive of which nothing was read is the device's fault, and no lead's.
+            whole = (unread | ~self._wiring.drives | ~self._usable).all(axis=1)
+            wrong &= ~self._wiring.drives[whole].any(axis=0)
         if not wrong.any():
             return Verdict(usable, flags)
         electrodes = self._wiring.faulty_electrodes(wrong)

@@ -22,7 +22,7 @@ from tactomo_models.physics.artifact import MODEL_ERROR, Artifact, nominal_noise
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.robust import median, robust_sigma
 from tactomo_models.scans.changes import CORRELATED, WRONG_WAY, Changes, missing
-from tactomo_models.scans.frame_noise import FrameNoiseEstimator, noise_limit
+from tactomo_models.scans.frame_noise import FrameNoiseEstimator, hides_press, noise_limit
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import (
     Flag,
@@ -129,7 +129,11 @@ class ChannelTare:
         self._least_noise = (noiseless * self._per_volt) ** 2
         self._noise = np.where(valid, (of_change * self._per_volt) ** 2, UNUSABLE**2)
         self.relative_noise = np.sqrt(self._noise + MODEL_ERROR**2)
-        self._modes = _leading_modes(sensor.artifact.jacobian, np.where(valid, self._noise, np.inf))
+        jacobian = sensor.artifact.jacobian
+        self._modes = _leading_modes(jacobian, np.where(valid, self._noise, np.inf))
+        at_rest = self._noise + description.instrument.stability**2
+        self._at_rest = np.where(valid, at_rest, np.inf)
+        self._modes_at_rest = _leading_modes(jacobian, self._at_rest)
         self._error_share = self._error_share_of(predicted)
         asymmetry = asymmetry_of(wiring, self.reference)
         self._check = ScanCheck(wiring, self.reference, noise, valid, contrast, asymmetry)
@@ -227,7 +231,9 @@ class ChannelTare:
         total = self._total
         if not (quiet or electrodes) and _fell(total * change, total**2 * variance):
             flags |= Flag.REFERENCE_MISMATCH
-        common, beyond = 1.0, np.inf
+        common, beyond, hides = 1.0, np.inf, False
+        if quiet and ratio > 1:
+            hides = self._hides(change, variance, freedom, count)
         if not quiet:
             over = 1 + (change * np.sign(self.reference))[valid]
             common = median(over) or 1.0
@@ -244,8 +250,17 @@ class ChannelTare:
             precision=valid / variance,
             factor=common,
             signal_beyond_factor=beyond**0.5,
+            hides=hides,
         )
         return ChannelResult(changes, flags, electrodes, flags & ~self.flags | verdict.flags)
+
+    def _hides(self, change: FloatArray, variance: FloatArray, freedom: float, count: int) -> bool:
+        """Whether a press that would show by the tare's noise may be in a quiet, noisy scan."""
+        ways = self._modes_at_rest.shape[1]
+        along = self._modes_at_rest.T @ (change / np.sqrt(self._at_rest))
+        noise = float((self._modes_at_rest**2).sum(axis=1) @ (variance / self._at_rest)) / ways
+        told = noise_limit(count) - count
+        return hides_press(float(along @ along), ways, noise, freedom, told)
 
     def _check_length(self, volts: FloatArray, what: str) -> None:
         description = self._sensor.description
@@ -336,11 +351,20 @@ class Tare:
                 if result.changes.is_factor:
                     factor = result.changes.factor
                     faults.append(f"all {name} voltages are {factor:.3g} times those of the tare")
-        if self._are_swapped(changes):
+        if self._are_swapped(changes) or (
+            len(changes) == 2 and self._are_one(magnitude, structure)
+        ):
             flags |= Flag.CHANNELS_SWAPPED
         standing_flags = flags & (LEFT_OUT & ~own_flags | Flag.CREEPING)
         stage_s = {"data": time.perf_counter() - start_s}
         return Measurement(changes, flags, standing_flags, tuple(faults), stage_s)
+
+    def _are_one(self, magnitude: FloatArray | None, structure: FloatArray | None) -> bool:
+        """Tell whether both channels carry one sheet's scan: noise makes no two of them alike."""
+        is_measured = self.reference.is_noise_measured and not self.reference.lacks_noise
+        if magnitude is None or structure is None or not is_measured:
+            return False
+        return np.array_equal(magnitude, structure)
 
     def _are_swapped(self, changes: Mapping[Channel, Changes]) -> bool:
         """Tell whether the magnitude channel answers more than the structure channel.

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from daemon_bench import BOTH, REST, scan
 from tactomo_protocol import Channel
@@ -41,3 +42,24 @@ def test_a_frozen_channel_is_missing_and_told(bench: Start, frozen: tuple[Channe
     b.listener.event("converter_back")
     names = [event["name"] for event in b.listener.of("event")]
     assert names.count("converter_frozen") == len(frozen)
+
+
+def test_drives_that_repeat_are_left_out_and_the_rest_is_imaged(bench: Start) -> None:
+    b = bench(ports=2, lossless=True)
+    b.tare()
+    stuck = replace(scan(Channel.STRUCTURE, 1), counter=0).samples
+    for _ in range(3):
+        b.skin.counter += 1
+        for channel in BOTH:
+            fresh = scan(channel, b.skin.counter, REST)
+            half = len(stuck) // 2  # scans are drive-major
+            samples = np.concatenate([stuck[:half], fresh.samples[half:]])
+            is_stuck = channel == Channel.STRUCTURE
+            b.skin.line_of(channel).say(replace(fresh, samples=samples) if is_stuck else fresh)
+        frame = b.listener.frame(b.skin.counter)
+    assert "invalid_voltage" in frame["flags"]
+    assert "structure_missing" not in frame["flags"]
+    told = b.listener.event("converter_frozen")
+    assert "drive 0-1" in told["detail"]
+    assert "drive 8-9" not in told["detail"]
+    assert b.step(0.0)["flags"] == []

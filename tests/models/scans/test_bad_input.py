@@ -31,6 +31,7 @@ from tactomo_models import (
     SensorDescription,
     SkinSimulator,
     build_artifact,
+    load_description,
 )
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.bare_sheet import solve_bare_sheet
@@ -413,3 +414,70 @@ def test_whatever_comes_a_map_is_finite_or_absent(
                 assert image is None or np.isfinite(image).all()
             unknown = any(np.isnan(contact.pressure_kpa) for contact in frame.contacts)
             assert frame.pressure_kpa is None or unknown or np.isfinite(frame.pressure_kpa).all()
+
+
+@pytest.fixture(scope="module")
+def graded() -> Graded:
+    return Graded()
+
+
+class Graded:
+    """One graded sheet, of which nothing else tells what presses."""
+
+    def __init__(self) -> None:
+        description = load_description("graded_square")
+        self.drives = description.pairs.drive[:, 0]
+        self.skin = Skin(SkinSimulator(description))
+        self.reconstructor = Reconstructor(description)
+        self.reconstructor.set_reference(self.skin.reference())
+        self.rest = self.skin.scan()["magnitude"]
+
+    def frames(self, later: Change, *presses: Press) -> list[Reconstruction]:
+        self.reconstructor.reset()
+        self.reconstructor.reconstruct(self.rest, None)
+        scans = [later(self.skin.scan(*presses)) for _ in range(3)]
+        return [self.reconstructor.reconstruct(scan["magnitude"], None) for scan in scans]
+
+
+@pytest.mark.parametrize("pressure_kpa", [180.0, 40.0])
+def test_a_press_beside_drives_that_are_stuck_is_told_or_not_known(
+    graded: Graded, pressure_kpa: float
+) -> None:
+    """Stuck drives break reciprocity by what presses, as a noisy scan would."""
+
+    def stick(scans: Scans) -> Scans:
+        return {"magnitude": np.where(graded.drives < 8, graded.rest, scans["magnitude"])}
+
+    for frame in graded.frames(stick, Press(0.015, -0.01, pressure_kpa, 0.012)):
+        assert frame.contacts or Flag.NOISE_HIGH in frame.flags
+
+
+@pytest.mark.parametrize("pressure_kpa", [180.0, 40.0])
+def test_noise_that_may_hide_a_press_is_told(graded: Graded, pressure_kpa: float) -> None:
+    rng = np.random.default_rng(5)
+
+    def noisier(scans: Scans) -> Scans:
+        return each(lambda v: v + 1e-2 * rms(v) * rng.standard_normal(len(v)))(scans)
+
+    for frame in graded.frames(noisier, Press(0.015, -0.01, pressure_kpa, 0.012)):
+        assert frame.contacts or Flag.NOISE_HIGH in frame.flags
+    assert not any(frame.flags for frame in graded.frames(lambda scans: scans))
+
+
+def test_drives_that_were_not_read_are_no_leads_and_their_reciprocals_stand_in(
+    graded: Graded,
+) -> None:
+    def unread(scans: Scans) -> Scans:
+        return {"magnitude": np.where(graded.drives < 8, np.nan, scans["magnitude"])}
+
+    for x, y in ((-0.05, -0.05), (0.05, 0.0), (0.0, 0.0)):
+        for frame in graded.frames(unread, Press(x, y, 100.0, 0.012)):
+            assert frame.flags == Flag.INVALID_VOLTAGE
+            (contact,) = frame.contacts
+            assert math.hypot(contact.x_m - x, contact.y_m - y) < 0.002
+
+
+def test_one_sheets_scan_in_both_channels_is_told(reconstructor: Reconstructor, skin: Skin) -> None:
+    light = skin.scan(Press(0.015, -0.01, 40.0))["magnitude"]
+    assert Flag.CHANNELS_SWAPPED in reconstructor.reconstruct(light, light).flags
+    assert not reconstructor.reconstruct(**skin.scan()).flags
