@@ -345,8 +345,8 @@ class Events:
     #: Scans of one channel repeat bit for bit while their counter rises, although they had noise at
     #: the tare: the daemon treats them as missing. Of drives or measuring pairs that repeat, the
     #: daemon leaves out those alone (``invalid_voltage``). A converter that is frozen during the
-    #: first tare cannot be told from a source without noise; `tactomo doctor` then reports "no noise
-    #: at all"
+    #: first tare cannot be told from a source without noise; `tactomo doctor` then reports "no
+    #: noise at all"
     converter_frozen = EventKind("warning", end="converter_back")
     converter_back = INFO  #: The channel's scans change again
     #: A port was closed, unplugged, or cannot be opened. The daemon keeps trying
