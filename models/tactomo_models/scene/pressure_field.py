@@ -80,6 +80,7 @@ class PressureField:
     # peak that a contact starts with, in that unit: the middle of what the table answers to
     typical_peak: float
     size_limits: tuple[float, float]  # least and largest logarithm of the mean radius in metres
+    fills_box: bool = True  # whether the nodes lie all over their bounding box
     # (K, COLUMNS) parameters of each contact, as far as they are not fitted
     fixed: FloatArray = field(default_factory=lambda: np.zeros((0, COLUMNS)))
     # (K, COLUMNS) which are fitted
@@ -126,6 +127,7 @@ class PressureField:
             onset=onset,
             typical_peak=(onset + 1) / 2,
             size_limits=(SMALLEST_SIZE, largest),
+            fills_box=description.sheet.shape == "rectangle",
         )
 
     @property
@@ -223,6 +225,12 @@ class PressureField:
         each = self.split(parameters)
         for column, limits in zip((X, Y), self._sheet_limits, strict=True):
             _limit(each[:, column], *limits)
+        if not self.fills_box:
+            for contact in each:
+                off = (self.x_m - UNIT_M * contact[X]) ** 2 + (self.y_m - UNIT_M * contact[Y]) ** 2
+                nearest = off.argmin()
+                if off[nearest] > self.half_width_m**2:  # on the sheet, a node is nearer
+                    contact[[X, Y]] = self.x_m[nearest] / UNIT_M, self.y_m[nearest] / UNIT_M
         _limit(each[:, SIZE], *self.size_limits)
         elongation = np.maximum(np.hypot(each[:, E1], each[:, E2]), 1e-12)
         each[:, E1:HARMONIC] *= np.minimum(1, max_elongated / elongation)[:, None]

@@ -25,6 +25,8 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.bare_sheet import scan_voltages, solve_bare_sheet, transfer_resistances
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import mesh_sheet
+from tactomo_models.scene.parameters import COLUMNS, SIZE, UNIT_M, X, Y
+from tactomo_models.scene.pressure_field import PressureField
 from tactomo_protocol import Channel
 from variants import variant
 
@@ -241,3 +243,14 @@ def test_a_frame_is_nan_off_the_sheet() -> None:
             np.testing.assert_array_equal(np.isnan(image), palm.off_sheet)
     [contact] = frame.contacts
     assert np.hypot(contact.x_m + 0.03, contact.y_m - 0.03) < 0.002
+
+
+def test_a_fitted_press_never_leaves_the_sheet() -> None:
+    palm = load_description("palm_l")
+    field = PressureField.on(model(palm, 0.0025), None)
+    one = np.zeros((1, COLUMNS))
+    one[0, [X, Y, SIZE]] = 0.04 / UNIT_M, 0.03 / UNIT_M, np.log(0.01)  # in the notch
+    bounded = field.of(one).bounded(field.of(one).join(one))
+    x_m, y_m = UNIT_M * field.of(one).split(bounded)[0, [X, Y]]
+    assert palm.on_sheet(np.array([x_m]), np.array([y_m])).all()
+    assert np.hypot(x_m - 0.04, y_m) < 0.006  # straight down onto it
