@@ -25,21 +25,24 @@ from tactomo_client import (
     subscribe,
 )
 from tactomo_client.recording import open_recording
+from tactomo_models import load_description
 from waiting import PATIENCE_S, wait_until
 from whole_system import ANYWHERE, SENSOR, Demo, running_demo
 
-GRADED, SATURATING = "graded_square", "skin_round"
-AT_MM = (15.0, -10.0)
+GRADED, POLYGON, SATURATING = "graded_square", "palm_l", "skin_round"
+AT_MM = (-18.0, -15.0)
 PRESS = {"pressure_kpa": 200.0, "radius_mm": 10.0}
 NEAR_MM = 3.0
 
 
-@pytest.fixture(scope="module", params=[GRADED, pytest.param(SATURATING, marks=pytest.mark.slow)])
+@pytest.fixture(
+    scope="module", params=[GRADED, POLYGON, pytest.param(SATURATING, marks=pytest.mark.slow)]
+)
 def one_sheet(request: pytest.FixtureRequest) -> Iterator[tuple[Demo, str]]:
     """A demo, pressed at AT_MM, and its channel."""
     with running_demo("--description", request.param) as demo:
         demo.press(*AT_MM, **PRESS)
-        yield demo, "magnitude" if request.param == GRADED else "structure"
+        yield demo, "structure" if request.param == SATURATING else "magnitude"
 
 
 def pressed_frame(demo: Demo) -> Frame:
@@ -78,6 +81,12 @@ def test_a_press_becomes_a_contact_there_and_what_the_sheet_cannot_tell_is_absen
         assert frame.contacts[0].pressure_kpa is None
     with Daemon(demo.control) as daemon:
         status = daemon.status()
+    image = frame.map if channel == "magnitude" else frame.structure
+    assert image is not None
+    assert status.description is not None
+    off_sheet = load_description(status.description.model).off_sheet
+    expected = np.zeros(image.shape, bool) if off_sheet is None else off_sheet
+    np.testing.assert_array_equal(np.isnan(image), expected)
     assert len(status.ports) == 1
     assert status.incomplete_scans == 0
 
