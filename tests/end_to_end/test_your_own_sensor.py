@@ -5,6 +5,7 @@ Those are in tests/training.
 
 from __future__ import annotations
 
+import csv
 import re
 from pathlib import Path
 
@@ -74,15 +75,39 @@ def test_a_device_is_found_examined_tared_and_recorded(newcomer: Newcomer) -> No
     assert "/etc/tactomo/palm.toml" in newcomer.run(install)
 
 
+@pytest.mark.slow
+def test_a_bent_sheet_says_where_on_the_link_it_is_pressed(newcomer: Newcomer) -> None:
+    sheet = newcomer.folder / FILE
+    sheet.write_text(sheet.read_text() + "".join(PAGE.blocks("toml", "10")))
+    info, demo, press, watch, *files = PAGE.commands("10")
+    with newcomer:
+        assert "cylinder on left_forearm_link" in newcomer.run(info)
+        newcomer.run(demo)
+        newcomer.run(press)
+        newcomer.wait_for(watch, " mm ")
+        newcomer.follow(files)
+    with (newcomer.folder / "bent.csv").open(newline="") as table:
+        last = list(csv.DictReader(table))[-1]
+    place = [float(last[f"position_{axis}_m"]) for axis in "xyz"]
+    assert place == pytest.approx((0.027, 0.027, 0.140), abs=1.5e-3)  # as the page says
+    normal = [float(last[f"normal_{axis}"]) for axis in "xyz"]
+    assert normal == pytest.approx((0.71, 0.71, 0), abs=0.04)
+    assert last["mount_frame"] == "left_forearm_link"
+    assert (newcomer.folder / "bent_bag" / "metadata.yaml").exists()
+
+
 def test_what_is_refused_is_refused_in_the_pages_words(tmp_path: Path) -> None:
     right = PAGE.file(FILE)
     for written, wrong in (
         ("per_side = [5, 3] ", "per_side = 4\npitch_m = 0.03 "),
         ("length_m = 0.005 ", "length_m = 0.024 "),
         ("width_m = 0.120", "widht_m = 0.120"),
+        ("schema = 1", '[mount]\nframe = "arm"\n[mount.cylinder]\nradius_m = 0.018'),
     ):
         assert written in right
-        text = right.replace(written, wrong)
+        text = right.replace(written, wrong, 1)
+        if wrong.startswith("[mount]"):
+            text = f"{right}\n{wrong}"
         if wrong.startswith("per_side"):
             text = text.replace("pitch_m = 0.024 ", "")
         (tmp_path / FILE).write_text(text)

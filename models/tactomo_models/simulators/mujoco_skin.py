@@ -87,7 +87,8 @@ class MujocoSkin:
     Args:
         model: the `mujoco.MjModel`.
         site: its name. The site is the sheet's middle on the pressed side: x to the right, y up, z
-            out of the sheet.
+            out of the sheet. With a description that has a mount, the site is the origin of the
+            mount's frame, and the sheet lies around it as the mount says.
         description: the sensor, or the name of a shipped one.
         modulus_pa: effective modulus of what covers the sheet.
         radius_m: of whatever touches and is no sphere, capsule or cylinder.
@@ -184,8 +185,8 @@ class MujocoSkin:
         outside: list[Outside] = []
         lost_n = 0.0
         for contact, normal, other, force_n in self._contacts(data):
-            x, y, z = (contact.pos - middle) @ turned
-            if -(normal @ turned)[2] < FACING or abs(z) > REACH_M:
+            (x, y), height, out = self._on_sheet((contact.pos - middle) @ turned)
+            if -(normal @ turned) @ out < FACING or abs(height) > REACH_M:
                 outside.append(Outside(self._name(other), force_n, "behind the sheet"))
                 continue
             press = self._press(x, y, force_n, self._roundness(other))
@@ -196,6 +197,14 @@ class MujocoSkin:
             presses.append((press, share * force_n))
             lost_n += (1 - share) * force_n
         return presses, lost_n, tuple(outside)
+
+    def _on_sheet(self, point_m: FloatArray) -> tuple[FloatArray, float, FloatArray]:
+        """Return the place on the sheet below a point of the site's frame, height, and normal."""
+        mount = self.description.mount
+        if mount is None:
+            return point_m[:2], float(point_m[2]), np.array([0.0, 0.0, 1.0])
+        place, height = mount.unplace(point_m[None])
+        return place[0], float(height[0]), mount.place(place)[1][0]
 
     def _contacts(self, data: Any) -> Any:
         """Yield each contact with the body, its normal towards that, the other geom, the force."""

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from page import Page
-from tactomo_models import DataError
+from tactomo_models import DataError, load_description
+from variants import variant
 
 mujoco = pytest.importorskip("mujoco")
 gymnasium = pytest.importorskip("gymnasium")
@@ -190,3 +191,44 @@ def test_the_pages_code_runs() -> None:
     exec(feel, names)
     assert names["touch"].force_n == 0
     exec(observe, names | {"env": Pressing()})
+
+
+CAPSULE = """
+<mujoco>
+  <option timestep="0.002" gravity="0 0 0"/>
+  <default><geom solref=".004 1"/></default>
+  <worldbody>
+    <body name="arm" pos="0.3 -0.2 0.5" euler="20 40 0">
+      <geom name="arm" type="capsule" size=".05 .09"/>
+      <site name="skin"/>
+      <body name="ball" pos="{pos}">
+        <joint type="slide" axis="{axis}" damping="200" stiffness="1e-3" springref="-90e3"/>
+        <geom name="ball" type="sphere" size=".03" mass=".1"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_a_sheet_around_a_capsule_feels_where_a_ball_presses() -> None:
+    """At 40 degrees round the capsule and 20 mm along; the ball slides along the normal there."""
+    out = np.array([np.cos(np.radians(40)), np.sin(np.radians(40)), 0.0])
+    place = 0.08 * out + [0, 0, 0.02]
+    xml = CAPSULE.format(pos=" ".join(map(str, place)), axis=" ".join(map(str, out)))
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, STEPS)
+    mount = {"frame": "arm", "cylinder": {"radius_m": 0.05}}
+    sensor = variant(load_description("paper_square"), mount=mount)
+    touch = MujocoSkin(model, "skin", sensor, method="fit").feel(data)
+    assert touch.outside == ()
+    assert touch.force_n == pytest.approx(90, rel=0.02)
+    assert truth_n(touch) == pytest.approx(touch.force_n, rel=0.02)
+    row, column = np.unravel_index(touch.truth_kpa.argmax(), touch.truth_kpa.shape)
+    true_m = sensor.map_x_m[column], sensor.map_y_m[row]
+    assert true_m == pytest.approx((0.05 * np.radians(40), 0.02), abs=0.003)
+    (contact,) = touch.frame.contacts
+    assert contact.frame == "arm"
+    assert contact.position_m == pytest.approx(0.05 * out + [0, 0, 0.02], abs=2e-3)
+    assert contact.normal == pytest.approx(out, abs=0.05)

@@ -189,6 +189,7 @@ def _description_facts(description: SensorDescription) -> dict[str, Any]:
         "title": description.title,
         "sheet": f"{description.sheet.shape}, {width_mm:g} x {height_mm:g} mm",
         "electrodes": description.electrode_count,
+        **({"mount": f"{mount.kind} on {mount.frame}"} if (mount := description.mount) else {}),
         "voltages a scan": description.measurements,
         "pattern": str(description.pattern),
         "instrument": f"{description.instrument.voltages} voltages",
