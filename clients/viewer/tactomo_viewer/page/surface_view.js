@@ -13,6 +13,7 @@ const LEAST_ARROW = 0.12;
 const FULL_FORCE_N = 100;       // a firm push of a hand; larger forces have the largest arrow
 const LIFT = 0.004;             // of the radius: what lies on the surface is not hidden by it
 const RING_POINTS = 48;
+const CUT_OUT_PX = 1024;
 const EDGE_STEPS = 24;          // of an edge of the outline, which follows the surface
 const TURN_PER_PX = 0.008;      // radians
 
@@ -139,6 +140,7 @@ export class SurfaceView {
     if (this.mesh) {
       this.body.remove(this.mesh);
       this.mesh.geometry.dispose();
+      this.mesh.material.alphaMap.dispose();
       this.mesh.material.dispose();
     }
     const geometry = new THREE.BufferGeometry();
@@ -150,7 +152,7 @@ export class SurfaceView {
         uv.push(u, v);
         const node = iy * nx + ix;
         const square = [node, node + 1, node + nx + 1, node + nx];
-        if (ix < nx - 1 && iy < ny - 1 && square.every(isThere)) {
+        if (ix < nx - 1 && iy < ny - 1 && square.some(isThere)) {
           corners.push(square[0], square[1], square[2], square[0], square[2], square[3]);
         }
       }
@@ -160,9 +162,30 @@ export class SurfaceView {
     geometry.setAttribute("color", new THREE.Float32BufferAttribute(new Float32Array(3 * nx * ny), 3));
     geometry.setIndex(corners);
     geometry.computeVertexNormals();
-    const material = new THREE.MeshLambertMaterial({ vertexColors: true, side: THREE.DoubleSide });
+    const material = new THREE.MeshLambertMaterial({
+      vertexColors: true, side: THREE.DoubleSide, alphaMap: this.#cutOut(), alphaTest: 0.5,
+    });
     this.mesh = new THREE.Mesh(geometry, material);
     this.body.add(this.mesh);
+  }
+
+  // White where the sheet is: the mesh is cut along the outline, not along the map's nodes.
+  #cutOut() {
+    const { x: [x0, x1], y: [y0, y1], outline } = this.flat.sheet;
+    const canvas = document.createElement("canvas");
+    canvas.width = canvas.height = CUT_OUT_PX;
+    const c = canvas.getContext("2d");
+    for (const ring of outline) {
+      ring.forEach(([x, y], corner) => {
+        const at = [(x - x0) / (x1 - x0), (y1 - y) / (y1 - y0)].map((share) => share * CUT_OUT_PX);
+        if (corner) c.lineTo(...at);
+        else c.moveTo(...at);
+      });
+      c.closePath();
+    }
+    c.fillStyle = "#ffffff";
+    c.fill("evenodd");
+    return new THREE.CanvasTexture(canvas);
   }
 
   #colour({ image, frame, scale, colormap }) {
