@@ -42,14 +42,17 @@ class MethodError(ModelError):
 
 def explain(item: "ErrorDetails") -> str:
     """Turn one of pydantic's complaints about a file into "key = value: what is allowed"."""
-    key = ".".join(str(part) for part in item["loc"] if part not in ("one", "two"))  # no keys
+    key = _short(
+        ".".join(str(part) for part in item["loc"] if part not in ("one", "two"))
+    )  # no keys
+    given = _short(repr(item["input"]))
     message = item["msg"].removeprefix("Value error, ")
     if item["type"] == "extra_forbidden":
         return f"unknown key {key}"
     if item["type"] == "tuple_type":
-        return f"{key} = {item['input']!r}: give a list, in brackets"
+        return f"{key} = {given}: give a list, in brackets"
     if item["type"] == "finite_number":
-        return f"{key} = {item['input']!r}: give a finite number"
+        return f"{key} = {given}: give a finite number"
     if item["type"] == "missing":
         return f"{key} is missing"
     if not key:
@@ -58,4 +61,10 @@ def explain(item: "ErrorDetails") -> str:
         return f"{key}.{message}"
     if key.endswith("_m") and item["type"].startswith("less_than"):  # lengths are in metres
         message += f"; in millimetres? {item['input']:g} mm are {item['input'] * 1e-3:g} m"
-    return f"{key} = {item['input']!r}: {message}"
+    return f"{key} = {given}: {message}"
+
+
+def _short(text: str) -> str:
+    """A text, cut where it is longer than a line: anybody may have made the file."""
+    most = 100
+    return text if len(text) <= most else f"{text[:most]}... ({len(text)} characters)"

@@ -126,7 +126,7 @@ class ChannelTare:
         of_change = np.maximum(noise * np.sqrt(1 + 1 / scans), noiseless)
         size = np.abs(self.reference)
         self._per_volt = np.divide(1, size, out=np.zeros_like(size), where=valid)
-        self._least_noise = (noiseless * self._per_volt) ** 2
+        self._least_noise = np.where(valid, (noiseless * self._per_volt) ** 2, UNUSABLE**2)
         self._noise = np.where(valid, (of_change * self._per_volt) ** 2, UNUSABLE**2)
         self.relative_noise = np.sqrt(self._noise + MODEL_ERROR**2)
         jacobian = sensor.artifact.jacobian

@@ -416,6 +416,19 @@ def test_whatever_comes_a_map_is_finite_or_absent(
             assert frame.pressure_kpa is None or unknown or np.isfinite(frame.pressure_kpa).all()
 
 
+def test_a_frame_that_is_the_reference_over_again_is_no_division_by_zero(
+    paper: SensorDescription, artifact: Artifact
+) -> None:
+    """Of numbers that no sheet has, some are left out, and nothing is left to be noise."""
+    volts = np.random.default_rng(0).standard_normal(paper.measurements)
+    reconstructor = Reconstructor(paper, artifact)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        reconstructor.set_reference(Reference(volts, volts, np.abs(volts), None))
+        frame = reconstructor.reconstruct(volts, volts)
+    assert frame.flags
+
+
 @pytest.fixture(scope="module")
 def graded() -> Graded:
     return Graded()

@@ -155,6 +155,14 @@ def test_every_complaint_is_made_at_once(tmp_path: Path) -> None:
         assert key in said
 
 
+def test_an_error_repeats_no_more_than_a_line_of_what_a_file_says(tmp_path: Path) -> None:
+    file, long = tmp_path / "sensor.toml", "k" * 100_000
+    file.write_text(SMALL.replace('name = "small"', f'name = "{long}"\n{long} = 1'))
+    with pytest.raises(DescriptionError) as caught:
+        load_description(file)
+    assert len(str(caught.value)) < 1000
+
+
 def test_a_disc_takes_a_count_and_no_pitch(tmp_path: Path) -> None:
     text = (resources.files("tactomo_models.sensor.shipped") / "tank_disc.toml").read_text("utf-8")
     file = tmp_path / "disc.toml"
