@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 from tactomo_protocol import Channel
 
-from tactomo_models.arrays import FloatArray, Image
+from tactomo_models.arrays import FloatArray
 from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_models.errors import DataError, ModelError
 from tactomo_models.methods.magnitudes import BAD_MISFIT
@@ -332,7 +332,9 @@ class Reconstructor:
             tells = Channel.STRUCTURE if Channel.STRUCTURE in changes else Channel.MAGNITUDE
             if changes[tells].hides:
                 flags |= Flag.NOISE_HIGH
-        blank = self._image(np.zeros((self.description.map.nodes_y, self.description.map.nodes_x)))
+        blank = self.description.shown(
+            np.zeros((self.description.map.nodes_y, self.description.map.nodes_x))
+        )
         magnitude = blank if Channel.MAGNITUDE in changes else None
         return Reconstruction(
             map=magnitude,
@@ -383,10 +385,11 @@ class Reconstructor:
         pressure = None
         if estimate.tells_pressure and has_magnitude:
             pressure = pressure_map(areas, contacts, account.pressure_kpa if account else None)
+        shown = self.description.shown
         return Reconstruction(
-            map=self._image(estimate.map),
-            pressure_kpa=self._image(pressure),
-            structure=self._image(estimate.structure),
+            map=shown(estimate.map),
+            pressure_kpa=shown(pressure),
+            structure=shown(estimate.structure),
             contacts=contacts,
             tier=tier,
             reason="; ".join([estimate.reason, *measurement.faults]),
@@ -397,13 +400,6 @@ class Reconstructor:
             force_n=force_n,
             force_sigma_n=force_sigma_n,
         )
-
-    def _image(self, values: FloatArray | Image | None) -> Image | None:
-        """What a frame shows: NaN off a polygon."""
-        off_sheet = self.description.off_sheet
-        if values is None or off_sheet is None:
-            return None if values is None else np.asarray(values, np.float32)
-        return np.where(off_sheet, np.float32(np.nan), values).astype(np.float32)
 
     def _areas_of(self, estimate: Estimate) -> tuple[Areas, FloatArray, FloatArray]:
         """The pressed areas of an estimate, their magnitudes (K,) and uncertainties (K,)."""

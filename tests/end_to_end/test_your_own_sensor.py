@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import re
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from tactomo_models import (
     SkinSimulator,
     load_description,
 )
+from tactomo_models.sensor.outline import Pad
 from tactomo_protocol import Channel, Hello, SampleFormat
 
 PAGE = Page("docs/your_own_sensor.md")
@@ -94,6 +96,22 @@ def test_a_bent_sheet_says_where_on_the_link_it_is_pressed(newcomer: Newcomer) -
     assert normal == pytest.approx((0.71, 0.71, 0), abs=0.04)
     assert last["mount_frame"] == "left_forearm_link"
     assert (newcomer.folder / "bent_bag" / "metadata.yaml").exists()
+
+
+@pytest.mark.slow
+def test_a_sheet_of_another_outline_is_described_and_drawn(newcomer: Newcomer) -> None:
+    section = "A sheet of another outline"
+    with newcomer:
+        newcomer.follow(PAGE.commands(section))
+        assert (newcomer.folder / "my_palm.png").exists()
+        text = (newcomer.folder / "my_palm.toml").read_text("utf-8")
+        (keys,) = PAGE.blocks("toml", section)
+        raw, shown = tomllib.loads(text), tomllib.loads(keys)
+        raw["sheet"] |= shown["sheet"]
+        raw["electrodes"] |= {"pad_radius_m": shown["electrodes"]["pad_radius_m"]}
+        raw["electrodes"]["positions_m"] += shown["electrodes"]["positions_m"][2:]
+        pads = SensorDescription.model_validate(raw).placed_electrodes
+        assert sum(isinstance(each, Pad) for each in pads) == 1
 
 
 def test_what_is_refused_is_refused_in_the_pages_words(tmp_path: Path) -> None:

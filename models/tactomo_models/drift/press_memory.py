@@ -45,7 +45,7 @@ class PressMemory:
         image = frame.map if frame.structure is None else frame.structure
         if not frame.contacts or image is None:
             return
-        share = np.abs(image.ravel())
+        share = np.nan_to_num(np.abs(image.ravel()))  # NaN off the sheet
         if frame.structure is None:
             share = share / max(float(share.max()), 1e-12)
         cells = np.bincount(self._cell_of_map, share, minlength=self._number) / self._count

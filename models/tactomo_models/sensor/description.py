@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import hashlib
 from functools import cached_property
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Self, overload
 
 import numpy as np
 from pydantic import Field, model_validator
 from tactomo_protocol import Channel
 
-from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.arrays import BoolArray, FloatArray, Image, IntArray
 from tactomo_models.sensor.mount import Mount
 from tactomo_models.sensor.outline import Pad, RimElectrode
 from tactomo_models.sensor.pattern import Pairs, combined, ring_pairs
@@ -317,6 +317,18 @@ class SensorDescription(Section):
         if self.sheet.shape != "polygon":
             return None
         return ~self.on_sheet(*np.meshgrid(self.map_x_m, self.map_y_m))
+
+    @overload
+    def shown(self, image: FloatArray | Image) -> Image: ...
+
+    @overload
+    def shown(self, image: None) -> None: ...
+
+    def shown(self, image: FloatArray | Image | None) -> Image | None:
+        """An image (nodes_y, nodes_x) as frames show it: NaN where `off_sheet`."""
+        if image is None or self.off_sheet is None:
+            return None if image is None else np.asarray(image, np.float32)
+        return np.where(self.off_sheet, np.float32(np.nan), image).astype(np.float32)
 
     @cached_property
     def map_x_m(self) -> FloatArray:

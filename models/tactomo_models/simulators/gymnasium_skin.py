@@ -77,5 +77,5 @@ def _images(touch: Touch) -> dict[str, Any]:
     return {
         "pressure_kpa": np.nan_to_num(pressure, nan=0.0).astype(np.float32),
         "is_known": np.isfinite(pressure).astype(np.int8),
-        "structure": np.asarray(structure, np.float32),
+        "structure": np.nan_to_num(structure).astype(np.float32),
     }

@@ -168,7 +168,7 @@ class MujocoSkin:
         frame = self._reconstructor.reconstruct(
             scan.get(Channel.MAGNITUDE), scan.get(Channel.STRUCTURE)
         )
-        truth_kpa = self._nodes.on_map(pressure).astype(np.float32)
+        truth_kpa = self.description.shown(self._nodes.on_map(pressure))
         return Touch(frame, truth_kpa, force_n, lost_n, outside)
 
     def _noisy(self, volts: dict[Channel, FloatArray]) -> dict[Channel, FloatArray]:

@@ -22,6 +22,9 @@ from tactomo_models import (
     load_description,
 )
 from tactomo_models.arrays import FloatArray
+from tactomo_models.drift.drift_model import DriftSubspace
+from tactomo_models.drift.press_memory import PressMemory
+from tactomo_models.physics.artifact import load_or_build_artifact
 from tactomo_models.physics.bare_sheet import scan_voltages, solve_bare_sheet, transfer_resistances
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import mesh_sheet
@@ -241,6 +244,11 @@ def test_a_frame_is_nan_off_the_sheet() -> None:
         for image in (frame.map, frame.pressure_kpa):
             assert image is not None
             np.testing.assert_array_equal(np.isnan(image), palm.off_sheet)
+    memory = PressMemory(palm, DriftSubspace(palm, load_or_build_artifact(palm)))
+    memory.add(0.0, 600.0, frame)
+    creep = memory.creep(1.0, Channel.MAGNITUDE)
+    assert np.isfinite(creep).all()
+    assert 0 < np.count_nonzero(creep) < 50  # where it was pressed
     [contact] = frame.contacts
     assert np.hypot(contact.x_m + 0.03, contact.y_m - 0.03) < 0.002
 
