@@ -15,11 +15,12 @@ import serial
 from hostile_page import post
 from small_sensor import SMALL
 from tactomo.errors import AddressError, ConfigError, TactomoError
+from tactomo.protocols.native import NativeProtocol
 from tactomo.twin import Scene, TwinConfig
 from tactomo.twin.firmware import RATE_HZ_MIN
 from tactomo_client import ControlError
 from tactomo_client.messages import encode_request
-from tactomo_models import Press, SkinSimulator, load_description
+from tactomo_models import Press, SensorDescription, SkinSimulator, load_description
 from tactomo_models.arrays import FloatArray
 from tactomo_protocol import (
     Acknowledge,
@@ -488,6 +489,16 @@ def test_a_skin_that_fails_stops_the_twin_with_its_error(bench: Start) -> None:
 def test_a_wrong_setup_is_refused(wrong: dict[str, Any], says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         TwinConfig(load_description("paper_square"), **wrong)
+
+
+@pytest.mark.parametrize("begin", [TwinConfig, NativeProtocol], ids=["twin", "daemon"])
+def test_more_voltages_than_a_scan_can_have_are_told_at_the_start(
+    begin: Callable[[SensorDescription], object],
+) -> None:
+    raw = load_description("tank_disc").model_dump(by_alias=True, exclude_none=True)
+    raw["electrodes"] |= {"count": 64, "length_m": 0.004}
+    with pytest.raises(ConfigError, match=r"3904 voltages.*at most 1024; list fewer"):
+        begin(SensorDescription.model_validate(raw))
 
 
 def test_a_sensor_of_one_channel_has_no_two_ports() -> None:

@@ -4,7 +4,13 @@
 them by name.
 """
 
-from tactomo.protocols.interface import ForeignProtocol, PortProtocol, Reading, Trouble
+from tactomo.protocols.interface import (
+    ForeignProtocol,
+    PortProtocol,
+    Reading,
+    Trouble,
+    check_scan_fits,
+)
 from tactomo.protocols.lines import LineProtocol
 from tactomo.protocols.registry import (
     NATIVE,
@@ -23,6 +29,7 @@ __all__ = [
     "Reading",
     "Trouble",
     "available_protocols",
+    "check_scan_fits",
     "emulator_of",
     "find_protocol",
     "protocol_named",

@@ -40,6 +40,17 @@ class Trouble(NamedTuple):
     next_step: str
 
 
+def check_scan_fits(description: SensorDescription) -> None:
+    """Raise `ConfigError` for a sensor whose scan has more voltages than travel in one."""
+    if description.measurements > MAX_SAMPLES:
+        raise ConfigError(
+            f"{description.name} has {description.measurements} voltages, and a scan at most "
+            f"{MAX_SAMPLES}",
+            "list fewer drive or measuring pairs in its [pattern]; files of any number of voltages "
+            "are reconstructed by tactomo reconstruct",
+        )
+
+
 class PortProtocol:
     """A language of devices, as one port speaks it; a subclass decodes with `feed`."""
 
@@ -158,12 +169,7 @@ class ForeignProtocol(PortProtocol):
                 "carries one",
                 "give the description of a sensor with one channel, such as tank_disc",
             )
-        if description.measurements > MAX_SAMPLES:
-            raise ConfigError(
-                f"{description.name} has {description.measurements} voltages, and a scan at most "
-                f"{MAX_SAMPLES}",
-                "list fewer drive or measuring pairs in its [pattern]",
-            )
+        check_scan_fits(description)
         self.description = description
         self.counts = ForeignCounts()
         self._failure: Trouble | None = None  # a mistake of the subclass, the last one

@@ -7,7 +7,7 @@ import math
 from tactomo_models import SensorDescription
 from tactomo_protocol import MAX_FRAME_BYTES, Command, CommandCode, Decoder, Hello, Packet, encode
 
-from tactomo.protocols.interface import PortProtocol
+from tactomo.protocols.interface import PortProtocol, check_scan_fits
 
 
 class NativeProtocol(PortProtocol):
@@ -22,6 +22,8 @@ class NativeProtocol(PortProtocol):
     acknowledges = True
 
     def __init__(self, description: SensorDescription | None = None) -> None:
+        if description is not None:
+            check_scan_fits(description)
         self._decoder = Decoder()
         self.counts = self._decoder.counts
         self._hello: Hello | None = None

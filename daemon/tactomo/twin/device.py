@@ -31,7 +31,7 @@ from threadpoolctl import threadpool_limits
 from tactomo.config import Endpoint
 from tactomo.endpoint import is_local
 from tactomo.errors import CommandError, ConfigError
-from tactomo.protocols import NATIVE, emulator_of, find_protocol
+from tactomo.protocols import NATIVE, check_scan_fits, emulator_of, find_protocol
 from tactomo.stream.commands import Nothing, explained
 from tactomo.twin.control import (
     ControlSocket,
@@ -111,6 +111,7 @@ class TwinConfig:
                 "there could press the twin",
                 "use tcp://127.0.0.1:PORT or ipc://PATH",
             )
+        check_scan_fits(self.description)
         channels = len(self.description.channels)
         if self.ports not in (1, 2) or self.ports > channels:
             raise ConfigError(
