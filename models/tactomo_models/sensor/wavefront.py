@@ -14,6 +14,7 @@ import numpy as np
 from tactomo_models.arrays import FloatArray, IntArray
 
 MAX_TRIANGLES: Final = 10_000
+LARGEST: Final = 1e6  # of a coordinate: a kilometre in millimetres; beyond, products overflow
 ON_EDGE: Final = 1e-6
 """In barycentric coordinates: what is nearer to an edge is on either side of it."""
 
@@ -166,7 +167,7 @@ class _NoTextureError(Exception):
 
 def _numbers(words: list[str], count: int) -> list[float]:
     values = [float(word) for word in words[:count]]
-    if len(values) < count or not np.isfinite(values).all():
+    if len(values) < count or not (np.abs(values) < LARGEST).all():
         raise ValueError
     return values
 

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from curved_surface import bent_obj
+from hypothesis import given
+from hypothesis import strategies as st
 from small_sensor import SMALL
 from tactomo_models import DescriptionError, load_description
 from tactomo_models.sensor.description_file import carried_text, parse_description
-from tactomo_models.sensor.mount import Mount
+from tactomo_models.sensor.mount import Mount, SurfaceMount
 
 RADIUS_M = 0.02
 MOUNTS = {
@@ -155,6 +157,20 @@ def test_a_surface_that_carries_no_sheet_is_named(
         mounted(tmp_path, "surface", obj=obj)
     for part in ["small.toml", "bent.obj", *said]:
         assert part in str(caught.value)
+
+
+WORDS = ["v", "vt", "f", "1", "0.02", "-1", "1/1", "2/2", "3/3", "9/9", "1e308", "nan", "/", "#"]
+
+
+@given(st.lists(st.lists(st.sampled_from(WORDS), max_size=5).map(" ".join), max_size=20))
+def test_whatever_an_obj_file_says_is_read_or_named(lines: list[str]) -> None:
+    text = bent_obj(0.06, 0.05, 0.02, 2) + "\n".join(lines)
+    said = ""
+    try:
+        SurfaceMount(file="any.obj", obj=text).check((0.06, 0.05), places(5))
+    except ValueError as error:
+        said = str(error)
+    assert not said or "any.obj" in said
 
 
 def test_one_mount_is_given(tmp_path: Path) -> None:
