@@ -220,6 +220,7 @@ class Memory:
     def __init__(self, seconds: float = 0.0) -> None:
         self.method = "auto"
         self.budget_s: float | None = None
+        self.budgets_s: list[float | None] = []  # of the frames made
         self.seconds = seconds
         self.reference: Reference | None = None
         self.curve: PressureCurve | None = None
@@ -248,6 +249,7 @@ class Memory:
         *,
         saturated: Collection[Channel] = (),
     ) -> Reconstruction:
+        self.budgets_s.append(self.budget_s)
         time.sleep(self.seconds)
         flags = Flag.SATURATED if saturated else Flag(0)
         if magnitude is None:

@@ -68,7 +68,7 @@ class MethodInForce:
     def obey(self, recorded: Effort) -> None:
         """Give frames what was effective when they were recorded."""
         if recorded != self.effective:
-            self._put_in_force(recorded)
+            self.put_in_force(recorded)
             self.requested = recorded
 
     def _request(self, requested: Effort) -> None:
@@ -76,10 +76,17 @@ class MethodInForce:
         if self.share < 1:
             time_s = self.share * (time_s or DEFAULT_BUDGET_S)
         modelled_ms = None if time_s is None else self._machine_speed.budget_s(time_s) * 1e3
-        self._put_in_force(Effort(requested.method, modelled_ms))
+        self.put_in_force(Effort(requested.method, modelled_ms))
         self.requested = requested
 
-    def _put_in_force(self, effective: Effort) -> None:
+    def lengthen(self, budget_ms: float) -> None:
+        """Give frames at least so much modelled work, until `put_in_force` is called."""
+        effective = self.effective
+        if effective.budget_ms is None or effective.budget_ms < budget_ms:
+            self.put_in_force(effective._replace(budget_ms=budget_ms))
+
+    def put_in_force(self, effective: Effort) -> None:
+        """Give frames this method and this much modelled work."""
         # Milliseconds are what is recorded: live and replay must come to the same seconds.
         budget_ms = effective.budget_ms
         self._reconstructor.method = effective.method

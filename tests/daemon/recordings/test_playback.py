@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from daemon_bench import HELLO, Bench, Listener, Memory, scan
 from tactomo.config import load_config
+from tactomo.imaging.imaging import MOVED_BUDGET_MS
 from tactomo.protocols import protocol_named
 from tactomo.recordings.playback import Playback
 from tactomo.recordings.recording import Origin
@@ -172,6 +173,15 @@ def test_a_paused_replay_that_is_moved_shows_the_frame_there(play: Any, life: Li
         status = b.ask("status")
         assert (status["state"], status["replay"]["paused"]) == ("paused", True)
         assert status["replay"]["position_s"] == pytest.approx(middle_s, abs=0.5)
+
+
+def test_the_first_frame_after_a_move_has_the_time_to_be_found_anew(play: Any, life: Life) -> None:
+    b = play(life.path)
+    b.ask("replay", position_s=life.times_s[list(life.values)[5]])
+    b.until(lambda: len(counters(b)) == 1)
+    b.ask("replay", step=True)
+    b.until(lambda: len(counters(b)) == 2)
+    assert b.daemon._pipeline._imaging._reconstructor.budgets_s == [MOVED_BUDGET_MS / 1e3, None]
 
 
 def test_a_replay_does_not_run_ahead_of_who_reads_it(monkeypatch: pytest.MonkeyPatch) -> None:
