@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Self, TypeVar
+from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails
@@ -58,12 +58,6 @@ def _protocol(name: str) -> str:
     except ConfigError as error:
         raise ValueError(f"{error.cause}; {error.next_step}") from error
     return name
-
-
-def _local(endpoint: str) -> str:
-    if not is_local(endpoint):
-        raise ValueError("for other computers run `tactomo zenoh`")
-    return endpoint
 
 
 Endpoint = Annotated[str, AfterValidator(check_endpoint)]
@@ -185,15 +179,6 @@ class Robot(BaseModel):
     """Several skins of one computer, as their file has them: each in a table ``[skins.NAME]``."""
 
     skins: Annotated[dict[str, dict[str, Any]], Field(min_length=1)]
-    # Where the streams of all skins are available together
-    proxy: Annotated[Endpoint, AfterValidator(_local)] | None = None
-
-
-class Skins(NamedTuple):
-    """The configurations of several skins, and the address of their streams together."""
-
-    each: tuple[DaemonConfig, ...]
-    proxy: str | None
 
 
 def load_config(path: str | Path | None = None, **overrides: Any) -> DaemonConfig:
@@ -212,7 +197,7 @@ def load_config(path: str | Path | None = None, **overrides: Any) -> DaemonConfi
     return _checked(DaemonConfig, values, given, path)
 
 
-def load_skins(path: Path | None, **overrides: Any) -> Skins | DaemonConfig:
+def load_skins(path: Path | None, **overrides: Any) -> tuple[DaemonConfig, ...] | DaemonConfig:
     """Read a file that may describe several skins, and apply options to each.
 
     A key outside the tables ``[skins.NAME]`` is every skin's. A skin without addresses gets the
@@ -243,8 +228,8 @@ def load_skins(path: Path | None, **overrides: Any) -> Skins | DaemonConfig:
     ]
     if only is not None:
         return skins[0]
-    _check_apart(path, skins, robot.proxy)
-    return Skins(tuple(skins), robot.proxy)
+    _check_apart(path, skins)
+    return tuple(skins)
 
 
 def _default_addresses(number: int) -> dict[str, str]:
@@ -264,15 +249,10 @@ def _merged(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]
     return {**common, **own, **tables}
 
 
-def _check_apart(path: Path, skins: Sequence[DaemonConfig], proxy: str | None) -> None:
-    """Refuse skins that share a port, an address or a file, and streams that no proxy can find."""
-    owners = {} if proxy is None else {proxy: "the proxy"}
+def _check_apart(path: Path, skins: Sequence[DaemonConfig]) -> None:
+    """Refuse skins that share a port, an address or a file."""
+    owners: dict[str, str] = {}
     for skin in skins:
-        if proxy is not None and skin.stream.endswith(":0"):
-            raise ConfigError(
-                f"{path}: the proxy cannot know which port {skin.name}'s stream gets",
-                f"name a port or an ipc:// path below [skins.{skin.name}]",
-            )
         for own in (*skin.ports, skin.stream, skin.control, skin.metrics, skin.recording.file):
             if own is None or str(own).endswith(":0"):
                 continue

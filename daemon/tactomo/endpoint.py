@@ -29,7 +29,7 @@ HANDSHAKE_MS: Final = 3000  # who has not finished the handshake by then is cut 
 REBIND_S: Final = 2.0
 MAX_OPEN: Final = 8192  # files and connections of a process; the systemd units say the same
 ADDRESS_STEP: Final = 20
-"""From one skin's default TCP ports to the next one's; the proxy's is between."""
+"""From one skin's default TCP ports to the next one's."""
 
 
 def allow_connections() -> None:

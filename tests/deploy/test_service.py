@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from tactomo.acquisition import udev
 from tactomo.acquisition.adapters import Adapter
-from tactomo.config import Skins, load_config, load_skins
+from tactomo.config import load_config, load_skins
 from tactomo.errors import ServiceError
 from tactomo.service import installation
 
@@ -227,7 +227,7 @@ def test_udev_understands_the_rules(tmp_path: Path) -> None:
 )
 def test_the_examples_load(example: Path) -> None:
     loaded = load_skins(example)
-    assert all(skin.ports for skin in (loaded.each if isinstance(loaded, Skins) else [loaded]))
+    assert all(skin.ports for skin in (loaded if isinstance(loaded, tuple) else [loaded]))
 
 
 BUILD = "from hatchling.build import build_wheel; import sys; build_wheel(sys.argv[1])"

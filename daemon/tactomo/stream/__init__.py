@@ -1,1 +1,1 @@
-"""What others see: publisher, control socket, keys, access control, proxy, Zenoh."""
+"""What others see: publisher, control socket, keys, access control, Zenoh."""

@@ -72,15 +72,13 @@ def shared_mb(pid: int) -> float:
 
 @pytest.mark.slow
 def test_each_skin_is_served_and_found_by_its_name(
-    start: Callable[..., Robot], tmp_path: Path
+    start: Callable[..., Robot],
 ) -> None:
-    proxy = f"ipc://{tmp_path}/all.stream"
-    robot = start(proxy=proxy)
+    robot = start()
     robot.wait_ready()
     for name in NAMES:
-        for address in (robot.stream[name], proxy):
-            with subscribe(name, address=address) as frames:
-                assert frames.wait(PATIENCE_S) is not None
+        with subscribe(name, address=robot.stream[name]) as frames:
+            assert frames.wait(PATIENCE_S) is not None
         status = robot.status(name)
         assert status["sensor"] == name
         assert status["process"]["pid"] in children_of(robot.process.popen.pid)
@@ -94,7 +92,7 @@ def test_each_skin_is_served_and_found_by_its_name(
             "-s",
             "right",
             "--address",
-            proxy,
+            robot.stream["right"],
             "--json",
         ],
         capture_output=True,

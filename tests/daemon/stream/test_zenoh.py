@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import signal
@@ -22,6 +23,7 @@ import msgpack  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 import zenoh
+from hostile_page import SUBSCRIBE, post
 from logged_process import LoggedProcess, next_of
 from page import Page
 from tactomo.stream import zenoh_bridge
@@ -285,6 +287,80 @@ def test_late_joiners_get_the_last_status_at_once(
 
     for prefix in (topic("left", "status"), b"left/", b""):
         wait_until(partial(is_repeated, prefix), "a status at once")
+
+
+@pytest.mark.slow
+def test_a_status_of_a_daemon_that_is_gone_is_not_repeated(
+    desk: zenoh.Session, start: Callable[..., LoggedProcess], reader: Any
+) -> None:
+    address = start(bind="tcp://127.0.0.1:0").address
+    first = reader(address, topic("left", "status"))
+    put = partial(desk.put, "tactomo/arm/left/status", b"\x80", attachment="1")
+    wait_until(lambda: first.poll(0), meanwhile=put, step_s=0.02)
+
+    def is_silent() -> bool:
+        with reader(address, topic("left", "status")) as late:
+            return not late.poll(500)
+
+    wait_until(is_silent, "a status too old to be repeated")
+
+
+def test_zenoh_is_asked_for_what_somebody_wants_and_no_longer(
+    desk: zenoh.Session, start: Callable[..., LoggedProcess], reader: Any
+) -> None:
+    publisher = desk.declare_publisher("tactomo/arm/left/contacts")
+    address = start(bind="tcp://127.0.0.1:0").address
+    wanted = [reader(address, topic("left", "contacts")) for _ in range(2)]
+    wait_until(lambda: publisher.matching_status.matching, "a subscriber")
+    for one in wanted:
+        assert publisher.matching_status.matching
+        one.close()
+    wait_until(lambda: not publisher.matching_status.matching, "nobody")
+
+
+@pytest.mark.slow
+def test_a_slow_subscriber_slows_nobody(
+    desk: zenoh.Session, start: Callable[..., LoggedProcess], reader: Any
+) -> None:
+    running = start(bind="tcp://127.0.0.1:0")
+    counts, image = iter(range(1, 10_000)), bytes(640_000)
+
+    def put() -> None:
+        desk.put("tactomo/arm/left/map", image, attachment=str(next(counts)))
+
+    stalled = reader(running.address, topic("left", "map"))
+    wait_until(lambda: stalled.poll(0), meanwhile=put, step_s=0.02)  # and reads no more
+    healthy = reader(running.address, topic("left", "map"))
+    for _ in range(600):  # 384 MB: more than any buffer holds
+        put()
+        assert healthy.poll(PATIENCE_S * 1000)
+        healthy.recv()
+    resident = Path(f"/proc/{running.process.pid}/statm").read_text().split()[1]
+    assert int(resident) * os.sysconf("SC_PAGE_SIZE") < 400e6
+
+
+@pytest.mark.slow
+def test_a_source_that_never_answered_is_missed_once(
+    tmp_path: Path, start: Callable[..., LoggedProcess]
+) -> None:
+    with FakeSensor("left", f"ipc://{tmp_path}/left") as left:  # a port may be another's meanwhile
+        pass
+    running = start(left)
+    warning = running.said("source_silent")
+    assert f"nothing from {left.address}" in warning["detail"]
+    assert "start its daemon" in warning["next_step"]
+    with FakeSensor("left", left.address):
+        assert left.address in running.said("source_came")["detail"]
+
+
+def test_a_web_pages_subscription_gets_nothing(
+    desk: zenoh.Session, start: Callable[..., LoggedProcess], reader: Any
+) -> None:
+    running = start(bind="tcp://127.0.0.1:0")
+    one = reader(running.address, b"left/")
+    put = partial(desk.put, "tactomo/arm/left/contacts", b"\x80", attachment="1")
+    wait_until(lambda: one.poll(0), meanwhile=put, step_s=0.02)
+    assert b"left" not in post(running.address, [SUBSCRIBE + b"left/"])
 
 
 def test_what_is_lost_is_counted_and_told(

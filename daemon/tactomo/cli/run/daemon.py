@@ -14,7 +14,7 @@ from tactomo.cli.output import say
 if TYPE_CHECKING:
     from tactomo_models import SensorDescription
 
-    from tactomo.config import DaemonConfig, Skins
+    from tactomo.config import DaemonConfig
     from tactomo.recordings.playback import Playback
     from tactomo.recordings.recording import Recording
 
@@ -234,9 +234,9 @@ def _run_daemon(
     return daemon.run()
 
 
-def _run_skins(skins: Skins) -> int:
+def _run_skins(skins: tuple[DaemonConfig, ...]) -> int:
     """Serve several skins until stopped, and return the exit status."""
-    _prepare(skins.each[0])
+    _prepare(skins[0])
     from tactomo.cli.run.skins import SkinProcesses
 
     return SkinProcesses(skins).run()

@@ -16,7 +16,7 @@ import signal
 import socket
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Final
@@ -27,12 +27,11 @@ from tactomo_models.methods.trained_networks import SensorNetworks
 
 from tactomo.cli.failure import explain
 from tactomo.cli.parent_watch import stop_at_end_of
-from tactomo.config import DaemonConfig, Skins
+from tactomo.config import DaemonConfig
 from tactomo.ending import AS_WELL, ASKED, at_end
 from tactomo.log import configure_logging
 from tactomo.service.daemon import Daemon, load_model
 from tactomo.service.supervision import STATUS_PERIOD_S, notify
-from tactomo.stream.proxy import Proxy, serve
 
 TURN_S: Final = 0.2
 RESTART_S: Final = 2.0
@@ -43,15 +42,15 @@ log = structlog.get_logger()
 
 
 class _Process:
-    """One child: a skin's daemon, or the proxy, which says nothing and so is not watched."""
+    """One child: a skin's daemon."""
 
-    def __init__(self, name: str, run: Callable[[], int], ear: socket.socket | None) -> None:
+    def __init__(self, name: str, run: Callable[[], int], ear: socket.socket) -> None:
         self.name = name
         self.run = run
         self.ear = ear
         self.pid = 0
         self.status = "starting"
-        self.is_ready = ear is None
+        self.is_ready = False
         self.has_been_ready = False
         self.is_aborted = False
         self.is_done = False
@@ -60,7 +59,6 @@ class _Process:
 
     def hear(self) -> None:
         """Take note of what the daemon has notified."""
-        assert self.ear is not None
         for line in self.ear.recv(4096).decode("utf-8", "replace").splitlines():
             key, _, value = line.partition("=")
             if key == "READY":
@@ -75,15 +73,15 @@ class SkinProcesses:
     """The processes of several skins; `run` them until a signal asks to end.
 
     Args:
-        skins: their configurations, and the proxy's address.
+        skins: their configurations.
 
     Raises ModelError where a description or an artifact cannot be used.
     """
 
-    def __init__(self, skins: Skins) -> None:
+    def __init__(self, skins: Sequence[DaemonConfig]) -> None:
         self._skins = skins
         self._is_stopping = False
-        descriptions = {skin.description: load_description(skin.description) for skin in skins.each}
+        descriptions = {skin.description: load_description(skin.description) for skin in skins}
         self._artifacts = {name: load_model(each) for name, each in descriptions.items()}
         networks = [SensorNetworks(each) for each in descriptions.values()]
         self._networks = [each for each in networks if not each.missing]  # loaded by that
@@ -98,9 +96,7 @@ class SkinProcesses:
             folder = Path(undo.enter_context(tempfile.TemporaryDirectory(prefix="tactomo-")))
             leash, self._leash_end = os.pipe()
             self._leash = leash
-            processes = [self._daemon(skin, folder, undo) for skin in self._skins.each]
-            if self._skins.proxy is not None:
-                processes.append(_Process("proxy", self._run_proxy, None))
+            processes = [self._daemon(skin, folder, undo) for skin in self._skins]
             gc.collect()
             gc.freeze()  # a collection in a child would copy every page that it looks through
             undo.callback(_stop, processes)
@@ -110,24 +106,23 @@ class SkinProcesses:
 
     def _watch(self, processes: list[_Process]) -> int:
         is_ready, told_s = False, 0.0
-        ears = {process.ear: process for process in processes if process.ear is not None}
-        daemons = list(ears.values())
+        ears = {process.ear: process for process in processes}
         while not self._is_stopping:
             for ear in select.select(list(ears), [], [], TURN_S)[0]:
                 ears[ear].hear()
             for process in processes:
                 self._look_after(process)
-            if all(each.is_done for each in daemons):
+            if all(each.is_done for each in processes):
                 return 0
-            if not any(each.pid or each.has_been_ready for each in daemons):
+            if not any(each.pid or each.has_been_ready for each in processes):
                 return 1
-            if not is_ready and all(each.is_ready or not each.pid for each in daemons):
+            if not is_ready and all(each.is_ready or not each.pid for each in processes):
                 is_ready = True
                 notify("READY=1")
-                log.info("all_ready", skins=[each.name for each in daemons])
+                log.info("all_ready", skins=[each.name for each in processes])
             if time.monotonic() - told_s > STATUS_PERIOD_S:
                 told_s = time.monotonic()
-                status = "; ".join(f"{each.name} {each.status}" for each in daemons)
+                status = "; ".join(f"{each.name} {each.status}" for each in processes)
                 notify("WATCHDOG=1", f"STATUS={status}")
         notify("STOPPING=1", "STATUS=stopping")
         return 0
@@ -145,7 +140,7 @@ class SkinProcesses:
             status = os.waitstatus_to_exitcode(code)
             process.is_done = status == 0
             if not process.is_done:
-                process.is_ready = process.ear is None
+                process.is_ready = False
                 process.status = "ended, is started again"
                 log.error(
                     "skin_ended",
@@ -154,7 +149,7 @@ class SkinProcesses:
                     next_step="the lines before say why; "
                     f"started again in {RESTART_S:g} s, unless no skin ever got ready",
                 )
-        elif process.ear is not None and process.is_ready and now_s - process.fed_s > WATCHDOG_S:
+        elif process.is_ready and now_s - process.fed_s > WATCHDOG_S:
             log.error("skin_hangs", sensor=process.name, watchdog_s=WATCHDOG_S)
             # Its log then has where each thread was; what is stopped obeys SIGKILL alone.
             os.kill(process.pid, signal.SIGKILL if process.is_aborted else signal.SIGABRT)
@@ -172,11 +167,9 @@ class SkinProcesses:
                     signal.signal(number, signal.SIG_DFL)
             os.close(self._leash_end)
             stop_at_end_of(self._leash)
-            os.environ.pop("NOTIFY_SOCKET", None)
             os.environ.pop("WATCHDOG_PID", None)
-            if process.ear is not None:
-                os.environ["NOTIFY_SOCKET"] = process.ear.getsockname()
-                os.environ["WATCHDOG_USEC"] = str(round(WATCHDOG_S * 1e6))
+            os.environ["NOTIFY_SOCKET"] = process.ear.getsockname()
+            os.environ["WATCHDOG_USEC"] = str(round(WATCHDOG_S * 1e6))
             status = process.run()
         except Exception as error:
             words = explain(error)
@@ -196,10 +189,6 @@ class SkinProcesses:
             return Daemon(skin, artifact=self._artifacts[skin.description]).run()
 
         return _Process(skin.name, run, ear)
-
-    def _run_proxy(self) -> int:
-        serve(Proxy([skin.stream for skin in self._skins.each], str(self._skins.proxy)))
-        return 0
 
     def _on_signal(self, _: int, __: FrameType | None) -> None:
         self._is_stopping = True

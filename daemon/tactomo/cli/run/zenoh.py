@@ -66,11 +66,12 @@ def zenoh(
     if bool(sources) == bool(bind):
         raise typer.BadParameter("give --from or --bind, one of the two")
     with needs("Zenoh", "pip install 'tactomo[zenoh]'"):
-        from tactomo.stream.zenoh_bridge import ZenohBridge, ZenohProxy
+        from tactomo.stream.zenoh_bridge import ZenohBridge
+        from tactomo.stream.zenoh_proxy import ZenohProxy
     from tactomo_client.keys import as_keys
 
     from tactomo.log import configure_logging
-    from tactomo.stream.proxy import serve
+    from tactomo.stream.relay import serve
 
     configure_logging(log_level, log_format)
     if bind:

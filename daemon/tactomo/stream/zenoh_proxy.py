@@ -1,0 +1,245 @@
+"""Zenoh's streams at one address of this computer, for subscribers of ZeroMQ.
+
+Zenoh is asked for just what subscribers ask for. Sensors are told apart by their topics, as ever.
+What does not fit into a slow subscriber's queue is lost to that one alone.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+from typing import Any, Final
+
+import zenoh
+import zmq
+from tactomo_client import MessageError
+from tactomo_client.messages import KINDS, STATUS, check_sensor_name
+from tactomo_client.schema import EVENTS, STALE_AFTER_S
+
+from tactomo.events import RateLimit
+from tactomo.stream.access_control import STREAM, Context
+from tactomo.stream.relay import LOOK_S, POLL_MS, QUEUED, Relay, tell, waiting
+from tactomo.stream.subscriptions import SUBSCRIBERS_CUT, Subscribers
+from tactomo.stream.zenoh_bridge import open_session
+from tactomo.stream.zenoh_publication import MAX_SENSORS
+
+LINGER_MS: Final = 200
+MAX_TOPIC_BYTES: Final = 128
+MAX_KEYS: Final = 256
+"""Beyond as many, all that there is is subscribed to."""
+
+
+class ZenohProxy(Relay):
+    """One address of this computer for what Zenoh has.
+
+    Args:
+        robot: whose skins; ``*`` for every robot's.
+        endpoint: where to bind; no other computer may reach it.
+        configuration: Zenoh's file; None: this computer alone.
+    """
+
+    def __init__(self, robot: str, endpoint: str, configuration: Path | None = None) -> None:
+        super().__init__([f"tactomo/{robot}"])
+        self._endpoint = endpoint
+        self._configuration = configuration
+        self._inlet: _Inlet | None = None
+        self._statuses: dict[bytes, tuple[bytes, float]] = {}  # the last of each, and when it came
+        self._flood = RateLimit()
+
+    def open(self) -> None:
+        """Bind, and open Zenoh.
+
+        Raises:
+            AddressError: the address cannot be had, or can be reached from other computers; or as
+                `open_session` does.
+            ConfigError: as `open_session` does.
+        """
+        self._outlet: zmq.Socket[bytes] = self._context.socket(zmq.XPUB)
+        self._outlet.setsockopt(zmq.SNDHWM, QUEUED)
+        self._readers = Subscribers(
+            self._outlet, self._endpoint, STREAM, self._on_event, None, "--bind"
+        )
+        self.address = self._readers.address
+        session = open_session(self._configuration, "connect")
+        self._inlet = _Inlet(self._context, session, self.sources[0])
+
+    def run(self) -> None:
+        """Pass messages on until `stop`."""
+        inlet, look_at_s = self._inlet, 0.0
+        assert inlet is not None
+        poller = zmq.Poller()
+        poller.register(self._outlet, zmq.POLLIN)
+        poller.register(inlet.socket, zmq.POLLIN)
+        while not self._stopping.is_set():
+            ready = dict(poller.poll(POLL_MS))
+            if self._outlet in ready:
+                self._pass_subscriptions(inlet)
+            for message in waiting(inlet.socket) if inlet.socket in ready else ():
+                self._note(message)
+                self._outlet.send(message, zmq.DONTWAIT)
+            self._readers.peers.check()
+            if time.monotonic() >= look_at_s:
+                look_at_s = time.monotonic() + LOOK_S
+                inlet.ask_news()
+
+    def close(self) -> None:
+        """Close everything, whatever `open` came to."""
+        if self.address:
+            self._readers.close()
+            self._outlet.close(LINGER_MS)
+        if self._inlet is not None:
+            self._inlet.close()
+        super().close()
+
+    def _pass_subscriptions(self, inlet: _Inlet) -> None:
+        """Ask for what the first one asks for here, and no more for what none does."""
+        before, cuts = set(self._readers.prefixes), self._readers.cuts
+        joined = {prefix for joins, prefix in self._readers.changes() if joins}
+        now = set(self._readers.prefixes)
+        inlet.ask(now - before, before - now)
+        # To the first of a prefix Zenoh says again how it is, to the others we do.
+        self._repeat_statuses(joined & before)
+        if self._readers.cuts > cuts and self._flood.allows():
+            self._on_event("subscribers_cut", *SUBSCRIBERS_CUT)
+
+    def _on_event(self, name: str, detail: str, next_step: str = "", *_: str, **__: str) -> None:
+        tell(name, EVENTS[name].severity, detail, next_step)
+
+    def _repeat_statuses(self, prefixes: set[bytes]) -> None:
+        oldest_s = time.monotonic() - STALE_AFTER_S
+        for topic, (message, came_s) in self._statuses.items():
+            if came_s > oldest_s and any(topic.startswith(prefix) for prefix in prefixes):
+                self._outlet.send(message, zmq.DONTWAIT)
+
+    def _note(self, message: bytes) -> None:
+        """Keep the last status of each sensor."""
+        topic, _, _ = message[:MAX_TOPIC_BYTES].partition(b"\0")
+        is_known = len(self._statuses) < MAX_SENSORS or topic + b"\0" in self._statuses
+        if topic.endswith(f"/{STATUS}".encode()) and is_known:
+            self._statuses[topic + b"\0"] = message, time.monotonic()
+
+
+class _Inlet:
+    """Where Zenoh's messages come from, owned by the proxy's thread but where said otherwise."""
+
+    def __init__(self, context: Context, session: zenoh.Session, address: str) -> None:
+        self.address = address
+        self.socket: zmq.Socket[bytes] = context.socket(zmq.PULL)
+        self._arriving: zmq.Socket[bytes] = context.socket(zmq.PUSH)
+        for socket in (self.socket, self._arriving):
+            socket.set_hwm(QUEUED)
+        self.socket.bind("inproc://zenoh")
+        self._arriving.connect("inproc://zenoh")
+        self._session = session
+        self._prefixes: set[bytes] = set()
+        self._subscribers: dict[str, Any] = {}
+        self._lock = threading.Lock()  # of what follows, and of `_arriving`
+        self._counts: dict[str, int] = {}
+        self._statuses: dict[str, bytes] = {}  # the newest of each key
+        self._robots: dict[str, str] = {}  # whose skin each is here
+        self._lost = 0
+        self._loss_limit, self._name_limit = RateLimit(), RateLimit()
+        self._tokens = session.liveliness().declare_subscriber(
+            f"{self.address}/*", self._tell_presence, history=True
+        )
+
+    def ask(self, more: set[bytes], less: set[bytes]) -> None:
+        """Subscribe to some prefixes, and no more to others; the last status comes at once."""
+        self._prefixes = (self._prefixes | more) - less
+        wanted = {_key(self.address, prefix) for prefix in self._prefixes} - {""}
+        if len(wanted) > MAX_KEYS:
+            wanted = {_key(self.address, b"")}
+        if wanted != self._subscribers.keys():
+            with self._lock:
+                self._counts.clear()  # what was not asked for was not lost
+        for key in self._subscribers.keys() - wanted:
+            self._subscribers.pop(key).undeclare()
+        for key in wanted - self._subscribers.keys():
+            self._subscribers[key] = self._session.declare_subscriber(key, self._take)
+        self._ask_status({_key(self.address, prefix) for prefix in more}, only_news=False)
+
+    def ask_news(self) -> None:
+        """Ask for each status that somebody wants, as a daemon sends one every second."""
+        self._ask_status(set(self._subscribers), only_news=True)
+
+    def _ask_status(self, keys: set[str], only_news: bool) -> None:
+        for key in keys:
+            above, _, kind = key.rpartition("/")
+            if kind in ("*", STATUS):
+                self._session.get(
+                    f"{above}/{STATUS}",
+                    lambda reply: self._arrive(reply.ok, only_news) if reply.ok else None,
+                    consolidation=zenoh.ConsolidationMode.NONE,
+                )
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        """Hand over a sample, once where several subscriptions bring it; in Zenoh's thread."""
+        key, count = str(sample.key_expr), _count(sample)
+        with self._lock:
+            last = self._counts.get(key, 0)
+            if count == last:
+                return
+            if len(self._counts) < MAX_SENSORS * len(KINDS) or last:
+                self._counts[key] = count
+            self._lost += max(0, count - last - 1) if last else 0
+            if self._lost and self._loss_limit.allows():
+                tell("messages_lost", "warning", f"{self._lost} so far, of {key} the last")
+        self._arrive(sample)
+
+    def _tell_presence(self, sample: zenoh.Sample) -> None:
+        """Tell that a skin came or went, and whose name is free again; in Zenoh's thread."""
+        came = sample.kind == zenoh.SampleKind.PUT
+        tell("skin_came" if came else "skin_gone", "info", str(sample.key_expr))
+        _, robot, sensor = str(sample.key_expr).split("/")
+        with self._lock:
+            if not came and self._robots.get(sensor) == robot:
+                del self._robots[sensor]
+
+    def _arrive(self, sample: zenoh.Sample, only_news: bool = False) -> None:
+        key = str(sample.key_expr)
+        _, robot, sensor, kind = key.split("/")
+        data = f"{sensor}/{kind}".encode() + b"\0" + sample.payload.to_bytes()
+        with self._lock:
+            if self._arriving.closed or (only_news and self._statuses.get(key) == data):
+                return  # of a daemon that has gone, the bridge still has the last status
+            if (other := self._robots.setdefault(sensor, robot)) != robot:
+                if self._name_limit.allows():
+                    detail = f"{robot} and {other} both have a skin {sensor!r}"
+                    next_step = f"--robot {robot} serves the one that is left out"
+                    tell("same_sensor_twice", "warning", detail, next_step)
+                return
+            if kind == STATUS:
+                self._statuses[key] = data
+            try:
+                self._arriving.send(data, zmq.DONTWAIT)
+            except zmq.Again:
+                self._lost += 1
+
+    def close(self) -> None:
+        """Close the session, then the sockets."""
+        self._session.close()  # type: ignore[no-untyped-call]
+        with self._lock:
+            self._arriving.close(0)
+        self.socket.close(0)
+
+
+def _key(above: str, prefix: bytes) -> str:
+    """Return the key expression of the topics that begin so; empty where none can."""
+    sensor, slash, rest = prefix.decode("ascii", "replace").partition("/")
+    kind = rest.removesuffix("\0")
+    is_whole = kind != rest
+    try:
+        known = check_sensor_name(sensor) if slash else "*"
+    except MessageError:
+        return ""
+    if is_whole and kind not in KINDS:
+        return ""
+    return f"{above}/{known}/{kind if is_whole else '*'}"
+
+
+def _count(sample: zenoh.Sample) -> int:
+    try:
+        return int(sample.attachment.to_string()) if sample.attachment else 0
+    except ValueError:
+        return 0
