@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -100,6 +101,11 @@ def reconstruct_file(
     if not target.parent.is_dir():
         raise DataError(f"cannot write {target}: there is no folder {target.parent}; make it first")
     scans, reference = read or read_scans(source, description)
+    readings: dict[str, FloatArray] | None = None
+    if description.companion and read is None:
+        total = max(len(channel) for channel in scans.values())
+        readings, at_rest = read_companions(source, description, total)
+        reference = replace(reference, companions=tuple(at_rest.items()))
     if taught is not None and (why := taught.changed(reference)):
         raise CalibrationError(f"what was taught does not fit this skin: {why}; teach it anew")
     nodes = (description.map.nodes_y, description.map.nodes_x)
@@ -121,7 +127,10 @@ def reconstruct_file(
             for index in range(total):
                 magnitude, structure = (_scan(scans, n, index) for n in ("magnitude", "structure"))
                 start = time.perf_counter()
-                frame = reconstructor.reconstruct(magnitude, structure)
+                companions = None
+                if readings is not None:
+                    companions = [(k, float(each[index])) for k, each in readings.items()]
+                frame = reconstructor.reconstruct(magnitude, structure, companions=companions)
                 arrays.append({"seconds": time.perf_counter() - start, **_frame_row(frame)})
                 for contact in frame.contacts:
                     arrays.append(_contact_row(index, contact))
@@ -168,6 +177,37 @@ def read_scans(
         ) from error
     scans, references = scans_of(source, arrays, description)
     return scans, reference_at_rest(source, scans, references, description)
+
+
+def read_companions(
+    source: Path, description: SensorDescription, frames: int
+) -> tuple[dict[str, FloatArray], dict[str, float]]:
+    """Read the readings (T,) of the companions that are there, and their means at rest.
+
+    Raises:
+        DataError: the file cannot be read, or readings are not as many as frames.
+    """
+    arrays = read_arrays(source)
+    readings, at_rest = {}, {}
+    for name in description.companion:
+        key = f"companion_{name}"
+        if key in arrays:
+            readings[name] = checked(source, key, arrays[key], (None,))
+            if len(readings[name]) != frames:
+                raise DataError(
+                    f"{source}: {key} holds {len(readings[name])} readings of {frames} frames; "
+                    "give one a frame, NaN where there was none"
+                )
+        if f"{key}_reference" in arrays:
+            rest = np.atleast_1d(arrays[f"{key}_reference"])
+            mean = float(checked(source, f"{key}_reference", rest, (None,)).mean())
+            if not np.isfinite(mean):
+                raise DataError(
+                    f"{source}: {key}_reference holds no number; give readings with nothing on "
+                    "the skin, or leave it out for the description's offset"
+                )
+            at_rest[name] = mean
+    return readings, at_rest
 
 
 def reference_at_rest(

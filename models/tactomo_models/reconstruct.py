@@ -188,6 +188,7 @@ class Reconstructor:
         structure: FloatArray | None,
         *,
         saturated: Collection[Channel] = (),
+        companions: Collection[tuple[str, float]] | None = None,
     ) -> Reconstruction:
         """Reconstruct one frame.
 
@@ -195,11 +196,14 @@ class Reconstructor:
             magnitude: (M,) volts; None if that scan is missing.
             structure: (M,) volts; None if that scan is missing.
             saturated: channels whose device says that its converter clipped this scan.
+            companions: name of each companion and its reading in its own unit, NaN where it has
+                none; None where nobody reads them.
 
         Raises:
             DataError: a scan has another number of voltages than the sensor.
         """
-        return self.solve(self.compare(magnitude, structure, saturated=saturated))
+        measurement = self.compare(magnitude, structure, saturated=saturated, companions=companions)
+        return self.solve(measurement)
 
     def compare(
         self,
@@ -207,6 +211,7 @@ class Reconstructor:
         structure: FloatArray | None,
         *,
         saturated: Collection[Channel] = (),
+        companions: Collection[tuple[str, float]] | None = None,
     ) -> Measurement:
         """The first half of `reconstruct`, which costs little: what has changed."""
         if self._tare.asks_noise:
@@ -215,7 +220,7 @@ class Reconstructor:
                 self._prepare()
         magnitude = self._measured(Channel.MAGNITUDE, magnitude)
         structure = self._measured(Channel.STRUCTURE, structure)
-        return self._tare.changes(magnitude, structure, saturated)
+        return self._tare.changes(magnitude, structure, saturated, companions)
 
     def _measured(self, channel: Channel, scan: FloatArray | None) -> FloatArray | None:
         """A scan less the drives and pairs that repeat the last one; all of it may come again."""

@@ -33,6 +33,8 @@ TOUCHES_SEEN = frozenset(
         "saturated",
         "channels_skewed",
         "untaught",
+        "companion_missing",
+        "companion_disputed",
     )
 )
 """Flags under which every touch is still seen: see STREAM.md. Of any other nobody knows."""

@@ -85,6 +85,14 @@ FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
         "no press like this one was taught: the physics alone says where it is",
         "teach more of the skin by `tactomo teach live`",
     ),
+    "companion_missing": (
+        "a companion of the sensor description has no reading within its limits",
+        "check its cable and `limits`; the sheets stand alone meanwhile",
+    ),
+    "companion_disputed": (
+        "a companion contradicts the sheets and is left out",
+        "check its gain and offset, and that it was tared with nothing on the skin",
+    ),
 }
 FASTER = "give the daemon more of the processor, or choose a faster method or a budget"
 STATES: Mapping[str, tuple[str, str]] = {

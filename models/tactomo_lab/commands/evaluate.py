@@ -46,7 +46,7 @@ FIELD_MAPS = (
     *("ms", "p99"),
 )
 FIELD_CONTACTS = (
-    *("counted", "right to 10 %", "peak in σ", "surely wrong"),
+    *("counted", "right to 10 %", "force", "forces", "peak in σ", "surely wrong"),
     *("mm", "in σ", "place in σ", "area in σ", "overload right", "overload wrong"),
 )
 DAYS = (
@@ -242,6 +242,7 @@ def moving(
         "tactomo evaluate field --rows soft,graded --method fit --count 30",
         "tactomo evaluate field --seeds reporting --count 50 --json > field.json",
         "tactomo evaluate field --rows soft --picture soft_press.png",
+        "tactomo evaluate field --rows graded,mixed --companion 0.05 --json > companion.json",
     )
 )
 def field(
@@ -250,6 +251,14 @@ def field(
     rows: Annotated[str | None, typer.Option(help="Which rows, with commas. [all of them]")] = None,
     method: options.Method = "auto",
     sensor: options.Description = options.DEFAULT_DESCRIPTION,
+    companion: Annotated[
+        float | None,
+        typer.Option(
+            min=0.001,
+            max=1.0,
+            help="Put a load cell under the sheet that is wrong by such a share: 0.05. Still rows.",
+        ),
+    ] = None,
     picture: Annotated[
         Path | None,
         picture_option("Draw one soft contact, the middle one by correlation: truth and method"),
@@ -281,14 +290,18 @@ def field(
 
     description = load_description(sensor)
     scores: dict[str, list[Score]] = {}
-    for row in chosen_names(rows, ROWS, "--rows"):
+    known = ROWS if companion is None else STILL_ROWS
+    for row in chosen_names(rows, known, "--rows"):
         total = count if row in STILL_ROWS else None
-        for line, frames in scores_of_row(description, row, method, seeds, count).items():
+        lines_of = scores_of_row(description, row, method, seeds, count, companion)
+        for line, frames in lines_of.items():
             try:
                 scores[line] = list(shown(frames, total, line))
             except ModelError as error:  # of a row's own sensor, for which a method may not serve
                 say(f"left out: {line}: {error}", err=True)
-    settings = _settings(description.name, seeds, snr_of="change", method=method)
+    settings = _settings(
+        description.name, seeds, snr_of="change", method=method, companion=companion
+    )
     found: dict[str, Summary] = {line: summarise(own) for line, own in scores.items()}
     lines = {
         line: {**asdict(found[line]), "scores": [asdict(one) for one in own]}

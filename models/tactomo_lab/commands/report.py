@@ -55,6 +55,8 @@ FIGURES: Final = {
     "mm": Figure("centre_mm", ".2f", "centre error, median"),
     "p95": Figure("centre_mm_95", ".1f"),
     "right to 10 %": Figure("peak_right", ".0%", "peaks, of the true contacts"),
+    "force": Figure("force_error", ".1%", "error of all force, mean, where one contact presses"),
+    "forces": Figure("force_error_several", ".1%", "the same where several press"),
     "overload right": Figure(
         "overload_right", ".0%", "of contacts beyond the response table, told without a bound"
     ),

@@ -25,7 +25,7 @@ from tactomo_lab.evaluation.moving import (
 )
 from tactomo_lab.evaluation.play import Outcome, play
 from tactomo_lab.evaluation.regimes import make_case
-from tactomo_lab.scenes.case import Case
+from tactomo_lab.scenes.case import Case, with_companion
 from tactomo_lab.scenes.drawing import SeedSet, require_both_channels
 from tactomo_lab.scenes.measures import Score
 from tactomo_lab.scenes.still_scenes import SCENE_SHAPES, SceneShape, draw_still, still_case
@@ -50,12 +50,18 @@ SCENES_A_SEQUENCE = 10  # a moving scene has some 100 frames and takes a minute 
 
 
 def scores_of_row(
-    description: SensorDescription, row: str, method: str, seed_set: SeedSet, count: int
+    description: SensorDescription,
+    row: str,
+    method: str,
+    seed_set: SeedSet,
+    count: int,
+    companion: float | None = None,
 ) -> dict[str, Iterator[Score]]:
     """Frames of one of `ROWS` as a method reconstructs them, by the name of their line.
 
     Without those whose scan is lost, for a map of half a measurement is another question, and those
-    in which a palm is still to come. `count` is as `cases_of_row` has it.
+    in which a palm is still to come. `count` is as `cases_of_row` has it. `companion` is the
+    relative error of a load cell under the sheet; None for none.
 
     Raises:
         DataError: the sensor has a single channel, or no room for what presses.
@@ -64,7 +70,10 @@ def scores_of_row(
     return {
         line: (
             outcome.score
-            for outcome in play(cases, method)
+            for outcome in play(
+                cases if companion is None else (with_companion(case, companion) for case in cases),
+                method,
+            )
             if outcome.frame.scans.keys() >= set(outcome.case.description.channels)
             and outcome.frame.phase != COMING
         )

@@ -102,7 +102,7 @@ class Player:
             with threadpool_limits(1):
                 begin_s = time.thread_time()
                 if self.tracker is None:
-                    made = reconstructor.reconstruct(*scans)
+                    made = reconstructor.reconstruct(*scans, companions=frame.companions)
                 else:
                     made = self.tracker.reconstruct(frame.time_s, *scans)
                 seconds = time.thread_time() - begin_s

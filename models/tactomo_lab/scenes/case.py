@@ -8,6 +8,7 @@ signal-to-noise ratio. The `Case` is what is reconstructed (`evaluation.play`).
 from __future__ import annotations
 
 import hashlib
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ from tactomo_models.physics.artifact import cache_folder
 from tactomo_models.physics.mesh import SheetMesh
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scene.press import Press
+from tactomo_models.sensor.companion import Companion
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_protocol import Channel
 
@@ -46,6 +48,7 @@ SnrOf = Literal["voltage", "change"]
 
 SIMULATION = 4  # raise it when `simulation` changes: what it stored before is not read
 REFERENCE_SCANS = 20  # as a tare takes
+LOAD_CELL_N = 0.05  # noise of a load cell, 1/4000 of a cell for 200 N: a 24-bit bridge's
 CONTACT_NAMES = "ABCDEFGHIJ"  # of a plan's presses, by their order
 
 
@@ -102,6 +105,8 @@ class Frame:
     time_s: float = 0.0  # since the case's tare; told where the daemon's reference follows the skin
     # False where contacts are so near each other that either number of them would do
     countable: bool = True
+    # names and readings; None where nobody reads any
+    companions: Sequence[tuple[str, float]] | None = None
 
 
 @dataclass(frozen=True)
@@ -235,6 +240,21 @@ def cached(what: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     with suppress(OSError):
         write_whole(path, lambda file: np.savez(file, **arrays))
     return arrays
+
+
+def with_companion(case: Case, relative_error: float) -> Case:
+    """The same with a load cell under the whole sheet, in newtons, wrong by such a share."""
+    cell = Companion(gain_n_per_unit=1.0, noise_n=LOAD_CELL_N, relative_error=relative_error)
+    told = case.description.model_copy(update={"companion": {"load_cell": cell}})
+    rng = np.random.default_rng([zlib.crc32(case.name.encode()), case.number])
+
+    def read(frame: Frame) -> Frame:
+        force_n = case.truth_of(frame).force_n
+        reading = force_n * (1 + relative_error * rng.standard_normal())
+        reading += LOAD_CELL_N * rng.standard_normal()
+        return replace(frame, companions=[("load_cell", float(reading))])
+
+    return replace(case, description=told, frames=[read(frame) for frame in case.frames])
 
 
 def noise_std(volts: SimulatedVolts, name: Channel, snr_db: float, snr_of: SnrOf) -> float:

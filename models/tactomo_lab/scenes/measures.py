@@ -155,6 +155,8 @@ class Score:
     contrast: float
     opposite: bool
     snr_db: float
+    #: relative error of the force of all contacts together; NaN where none was reported
+    force_error: float = float("nan")
 
     @property
     def count_right(self) -> bool | None:
@@ -214,6 +216,7 @@ def score(
         contrast=case.plan.contrast,
         opposite=case.plan.opposite,
         snr_db=case.plan.snr_db,
+        force_error=made.force_n / truth.force_n - 1 if truth.force_n else float("nan"),
     )
 
 
@@ -348,6 +351,10 @@ class Summary:
     #: reported without a bound, and denied by a 95 % interval; NaN where none is beyond
     overload_right: float
     overload_wrong: float
+    #: force_error, force_error_several: mean size of the relative error of all force, where one
+    #: contact presses and where several do
+    force_error: float
+    force_error_several: float
     distrusted: float  #: share of scenes flagged as not to be trusted
     bad_unflagged: float  #: share of scenes with an ICC below `BAD_ICC` and not flagged so
     good_flagged: float  #: share of the other scenes that are flagged so
@@ -392,6 +399,8 @@ def summarise(scores: Sequence[Score]) -> Summary:
         ),
         overload_right=mean(contact.unbounded for contact in contacts if contact.beyond),
         overload_wrong=mean(contact.denied for contact in contacts if contact.beyond),
+        force_error=mean(abs(one.force_error) for one in scores if one.groups == 1),
+        force_error_several=mean(abs(one.force_error) for one in scores if one.groups > 1),
         distrusted=mean(one.distrusted for one in scores),
         bad_unflagged=mean(one.bad and not one.distrusted for one in scores),
         good_flagged=mean(one.distrusted for one in scores if not one.bad),

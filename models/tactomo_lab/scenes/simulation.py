@@ -233,6 +233,7 @@ class Truth:
     #: channel's change, in logarithm
     pressed: FloatArray
     contacts: tuple[TrueContact, ...]  #: one for each indenter
+    force_n: float  #: of all of them
 
 
 def truth_of(description: SensorDescription, presses: Sequence[Press]) -> Truth:
@@ -263,6 +264,7 @@ def truth_of(description: SensorDescription, presses: Sequence[Press]) -> Truth:
         map=_over_cells(magnitude),
         pressed=_over_cells(coverage * _saturation(description, pressure)),
         contacts=tuple(contacts),
+        force_n=1e3 * float((coverage * pressure).sum()) * step_x * step_y,
     )
 
 

@@ -123,7 +123,8 @@ class ContactSearch:
         aside = np.linalg.solve(normal, gradient)
         gain, area = np.zeros((2, len(self._nodes)))
         clearest = max(measured, key=lambda name: abs(self._dipoles[name]))
-        for name, own in zip(measured, np.split(J, len(measured)), strict=True):
+        of_sheets = sum(map(len, fitted.residuals.values()))  # companions come last
+        for name, own in zip(measured, np.split(J[:of_sheets], len(measured)), strict=True):
             sheet = self._fit.sheet(name)
             by_area = sheet.spot_sensitivity(self._probes, fitted.solutions[name])
             by_area *= (self._dipoles[name] / np.abs(sheet.bare_voltages))[:, None]

@@ -8,7 +8,8 @@ a linear image alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from tactomo_protocol import Channel
@@ -20,6 +21,7 @@ from tactomo_models.methods.magnitudes import BAD_MISFIT
 from tactomo_models.methods.method import Estimate, Skin, UnsolvableError
 from tactomo_models.methods.search import Belief, Search
 from tactomo_models.scans.changes import Changes
+from tactomo_models.scans.companion_forces import CompanionForce
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scene.field_account import FieldAccount, FieldAccountant
@@ -41,6 +43,8 @@ class Course:
     unexplained_s: float = 0.0  # of work on data that no field has explained yet
     frames_held: int = 0  # since the last structure scan
     account: FieldAccount | None = None  # of the belief
+    # what is wrong with each companion that contradicts the sheets, in words
+    disputed: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def at_rest(self) -> Course | None:
@@ -78,7 +82,7 @@ class Fit:
             judged = self._drifting(measurement) if course.drifts else measurement
             return self._held(course, judged)
         with measurement.timed("shape"):
-            course, measurement = self._followed(course, measurement, Budget(budget_s))
+            course, measurement = self._with_companions(course, measurement, budget_s)
         with measurement.timed("contacts"):
             account = self._account(course, measurement)
         assert course.belief is not None
@@ -105,7 +109,7 @@ class Fit:
         given_s = budget.left_s
         if course.drifts:
             drifting = self._drifting(measurement)
-            belief = self._search.advance(course.belief, Frame(drifting.changes, budget))
+            belief = self._search.advance(course.belief, Frame(drifting.data, budget))
             plain = self._without_drift(belief, measurement, given_s)
             if plain is not None:
                 return plain, measurement
@@ -113,7 +117,7 @@ class Fit:
                 return replace(course, belief=belief), drifting
             course = Course(drifts=False)
         propose = self._proposer(measurement)
-        belief = self._search.advance(course.belief, Frame(measurement.changes, budget, propose))
+        belief = self._search.advance(course.belief, Frame(measurement.data, budget, propose))
         fitted = belief.account.fitted
         unexplained_s = course.unexplained_s + given_s - budget.left_s
         if fitted.worst_misfit <= BAD_MISFIT:
@@ -126,11 +130,62 @@ class Fit:
         # This once the frame may take as long again. Nothing is proposed: who does so takes the
         # drift for specks.
         drifting = self._drifting(measurement)
-        beside = self._search.advance(None, Frame(drifting.changes, Budget(given_s)))
+        beside = self._search.advance(None, Frame(drifting.data, Budget(given_s)))
         field = beside.account.fitted
         if field.worst_misfit <= EXPLAINED and self._drifted(field, measurement) < MAX_DRIFT:
             return replace(course, belief=beside, drifts=True), drifting
         return replace(course, drifts=False if beside.done else None), measurement
+
+    def _with_companions(
+        self, course: Course, measurement: Measurement, budget_s: float
+    ) -> tuple[Course, Measurement]:
+        """The same as `_followed`, without the companions that contradict the sheets.
+
+        Companions are fitted beside the sheets first. Where that explains all data, nothing
+        contradicts. Else the sheets are fitted alone, from a cold start, and the frame may take as
+        long again.
+        """
+        companions = measurement.companions
+        if not companions:
+            return self._followed(course, measurement, Budget(budget_s))
+        kept = {name: one for name, one in companions.items() if name not in course.disputed}
+        fitted, judged = self._followed(
+            course, replace(measurement, companions=kept), Budget(budget_s)
+        )
+        assert fitted.belief is not None
+        felt = self._forces(fitted.belief, companions)
+        contradicted = {k for k, one in kept.items() if not one.agrees_with(felt[k][0])}
+        if kept and fitted.belief.done and (contradicted or not fitted.belief.is_explained):
+            alone, sheets = self._followed(
+                Course(drifts=course.drifts), replace(measurement, companions={}), Budget(budget_s)
+            )
+            assert alone.belief is not None
+            told = self._forces(alone.belief, companions)
+            if not all(companions[name].agrees_with(*told[name]) for name in kept):
+                fitted, judged, felt = alone, sheets, told
+        disputed = {
+            name: f"companion {name} reads {one.force_n:.3g} N where the sheets say "
+            f"{felt[name][0]:.3g} N: left out"
+            for name, one in companions.items()
+            if name not in judged.companions and not one.agrees_with(*felt[name])
+        }
+        return replace(fitted, disputed=disputed), judged
+
+    def _forces(
+        self, belief: Belief, companions: Mapping[str, CompanionForce]
+    ) -> dict[str, tuple[float, float]]:
+        """The force that each companion should feel of a belief, and its standard uncertainty."""
+        drawing = belief.account.fitted.drawing
+        by_share, by_pressure = drawing.slopes()[2:]
+        share, pressure = drawing.share, drawing.pressure_kpa
+        covariance = np.linalg.inv(belief.account.hessian)[:-1, :-1]
+        forces = {}
+        for name, one in companions.items():
+            weights = one.n_per_kpa[drawing.nodes]
+            slope = (weights * pressure) @ by_share + (weights * share) @ by_pressure
+            sigma_n = float(np.sqrt(slope @ covariance @ slope))
+            forces[name] = float(weights @ (share * pressure)), sigma_n
+        return forces
 
     def _without_drift(
         self, belief: Belief, measurement: Measurement, given_s: float
@@ -139,7 +194,7 @@ class Fit:
         if belief.how == "still" or belief.frames & (belief.frames - 1):
             return None
         propose = self._proposer(measurement)
-        plain = self._search.advance(None, Frame(measurement.changes, Budget(given_s), propose))
+        plain = self._search.advance(None, Frame(measurement.data, Budget(given_s), propose))
         return Course(plain) if plain.account.fitted.worst_misfit <= EXPLAINED else None
 
     def _drifted(self, fitted: FittedField, measurement: Measurement) -> float:
@@ -163,7 +218,7 @@ class Fit:
             return course.account
         return self._accountant.account(
             belief.account.fitted,
-            measurement.changes,
+            measurement.data,
             belief.alternatives,
         )
 
@@ -179,6 +234,8 @@ class Fit:
             flags |= Flag.NOT_CONVERGED
         if fitted.worst_misfit > BAD_MISFIT or account.goes_wrong_way:
             flags |= Flag.MISFIT_HIGH
+        if course.disputed:
+            flags |= Flag.COMPANION_DISPUTED
         how = belief.how + (", drifted since the tare" if course.drifts else "")
         return Estimate(
             map=account.map if Channel.MAGNITUDE in measurement.changes else None,
@@ -191,7 +248,7 @@ class Fit:
             misfit=fitted.misfit,
             flags=flags,
             made_by="fit",
-            reason=f"{how}, {_in_words(belief)}",
+            reason="; ".join([f"{how}, {_in_words(belief)}", *course.disputed.values()]),
             carried=course,
             lasting=course.at_rest,
         )
@@ -204,7 +261,7 @@ class Fit:
             raise UnsolvableError("the structure channel is missing")
         with measurement.timed("contacts"):
             held = self._with_outlines_of(belief.account.fitted, measurement)
-            account = self._accountant.account(held, measurement.changes)
+            account = self._accountant.account(held, measurement.data)
         if held.misfit > BAD_MISFIT or account.goes_wrong_way:
             raise UnsolvableError("the structure channel is missing")
         if len(last.areas) == len(account.areas):  # outlines are no surer than they were
@@ -227,10 +284,10 @@ class Fit:
         assert isinstance(last.family, PressureField)
         family = last.family.with_peaks_alone(last.parameters)
         parameters = family.join(family.fixed)
-        held = self._field_fit.evaluate(family, parameters, last.log_ratio, measurement.changes)
+        held = self._field_fit.evaluate(family, parameters, last.log_ratio, measurement.data)
         assert held is not None
         steps = 3  # pressures alone are nearly linear
-        return self._field_fit.refine(held, measurement.changes, Budget(1.0), 0.0, steps)
+        return self._field_fit.refine(held, measurement.data, Budget(1.0), 0.0, steps)
 
 
 def _in_words(belief: Belief) -> str:

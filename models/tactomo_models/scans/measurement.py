@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from tactomo_protocol import Channel
 
 from tactomo_models.scans.changes import Changes
+from tactomo_models.scans.companion_forces import CompanionForce, SheetsAndCompanions
 from tactomo_models.scans.plausibility import Flag
 
 
@@ -27,6 +28,15 @@ class Measurement:
     #: seconds spent in each stage of this frame so far
     stage_s: dict[str, float] = field(default_factory=dict)
     may_drift: bool = True  #: whether a drift since the tare may explain what contacts do not
+    #: of each companion that has a usable reading
+    companions: Mapping[str, CompanionForce] = field(default_factory=dict)
+
+    @property
+    def data(self) -> Mapping[Channel, Changes]:
+        """The changes, with the companions that are fitted beside them."""
+        if not self.companions:
+            return self.changes
+        return SheetsAndCompanions(self.changes, self.companions)
 
     @property
     def is_quiet(self) -> bool:

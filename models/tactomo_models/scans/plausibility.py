@@ -59,6 +59,8 @@ class Flag(IntFlag):
     REFERENCE_DISPUTED = 16384  # the skin at the start was not as last known; set by who tares
     UNTAUGHT = 32768  # the skin was taught, and no press like this one: the physics alone locates
     CREEPING = 65536  # what is taken for creep may hide a touch
+    COMPANION_MISSING = 131072  # a companion has no usable reading; the sheets stand alone
+    COMPANION_DISPUTED = 262144  # a companion contradicts the sheets, and is left out
 
     def names(self) -> list[str]:
         """Names of the flags that are set, in lower case, as the stream carries them."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,6 +36,8 @@ class Reference:
     magnitude_creep: FloatArray | None = None
     structure_creep: FloatArray | None = None  #: (M,) likewise
 
+    #: names of companions and their mean readings at rest, in their own units
+    companions: Collection[tuple[str, float]] | None = None
     #: whether scans at rest told the noise; else reciprocity did, and it is an upper bound
     is_noise_measured: bool = True
 

@@ -21,6 +21,7 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scans.changes import Changes
+from tactomo_models.scans.companion_forces import companions_of
 
 FALSE_ALARM = 1e-4  # chance that a still frame is solved again, which costs a few solves
 MEMORY = 5  # frames of a mean; a longer one sees a small change later, and no more of them
@@ -48,8 +49,15 @@ def is_still(
 
 def are_still(settled: Mapping[Channel, Changes], new: Mapping[Channel, Changes]) -> bool:
     """Tell whether scans of all channels are of the same scene; not if their channels differ."""
-    return new.keys() == settled.keys() and all(
-        is_still(settled[name], changes) for name, changes in new.items()
+    forces, before = companions_of(new), companions_of(settled)
+    return (
+        new.keys() == settled.keys()
+        and forces.keys() == before.keys()
+        and all(is_still(settled[name], changes) for name, changes in new.items())
+        and all(
+            one.agrees_with(before[name].force_n, before[name].sigma_n)
+            for name, one in forces.items()
+        )
     )
 
 
@@ -75,7 +83,8 @@ class Since:
     ) -> Since:
         """Nothing has come yet."""
         normal = jacobian.T @ jacobian + np.diag(precision)
-        follow = np.linalg.solve(np.linalg.cholesky(normal), jacobian.T)
+        of_sheets = jacobian[: sum(len(each.change) for each in settled.values())]
+        follow = np.linalg.solve(np.linalg.cholesky(normal), of_sheets.T)
         return cls(settled, follow, np.zeros(len(precision)))
 
     def taken(self, new: Mapping[Channel, Changes]) -> tuple[Since, bool]:

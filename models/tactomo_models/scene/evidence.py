@@ -27,6 +27,7 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scans.changes import Changes
+from tactomo_models.scans.companion_forces import SheetsAndCompanions
 
 FALSE_ALARM = 1e-3  # chance that data which an account explains are taken for unexplained
 
@@ -42,6 +43,8 @@ class Likelihood:
     def of(cls, measured: Mapping[Channel, Changes]) -> Likelihood:
         """The likelihood of what residuals of these changes are."""
         inverse = [(each.weight > 0) / each.variance_inflation for each in measured.values()]
+        if isinstance(measured, SheetsAndCompanions):
+            inverse.append(np.full(len(measured.companions), 1 / measured.inflation))
         together = np.concatenate(inverse)
         return cls(np.sqrt(together), max(float(together.sum()), 1.0))
 

@@ -114,7 +114,7 @@ class FieldAccountant:
             return J
         if family.light(fitted.parameters).any():
             sensed = self._fit.jacobian_at_onset(fitted, measured)
-            start = [*measured].index(Channel.MAGNITUDE) * len(J) // len(measured)
+            start = [*measured].index(Channel.MAGNITUDE) * len(sensed)
             J[start : start + len(sensed)] = sensed
         return J
 

@@ -4,8 +4,10 @@ Each sheet's response turns the same pressure into that sheet's conductivity. Th
 the forward model is solved for every trial, because at a ratio of 100 the paper's linear form
 (equations 5 to 9) is far outside the range of its Jacobian.
 
-    minimise sum_s |W_s (d_s(p, c) - measured_s)|^2 + |(p - p0) / prior|^2   (Levenberg-Marquardt)
+    minimise sum_s |W_s (d_s(p, c) - measured_s)|^2 + sum_k ((w_k . p - F_k) / sigma_k)^2
+           + |(p - p0) / prior|^2   (Levenberg-Marquardt)
 
+A companion such as a load cell feels the force w . p and reads F: one row.
 What the parameters mean is a family's matter: a few contacts (`pressure_field`), or a level set.
 In both, nothing is pressed away from contacts, so that only nodes near them change: solve and
 Jacobian go by the pressed area.
@@ -25,6 +27,7 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.compiled_sheet import FrozenAreas, Pressed, Solution
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scans.changes import Changes
+from tactomo_models.scans.companion_forces import SheetsAndCompanions
 from tactomo_models.scene.drawing import Drawing
 from tactomo_models.scene.parameters import PEAK
 from tactomo_models.scene.pressure_field import PressureField
@@ -75,6 +78,7 @@ class Background:
 
     family: PressureField  # what their parameters mean
     parameters: FloatArray  # (N,) of the family
+    drawing: Drawing = field(repr=False)  # the contacts on the nodes
     sheets: Mapping[Channel, FrozenAreas] = field(repr=False)
     away: float  # what they add to the cost: by what is likely of them
 
@@ -93,14 +97,16 @@ class FittedField:
     cost: float  # what is minimised, the prior included
     background: Background | None = field(default=None, repr=False)  # contacts beside it
     damping: float = 1.0  # Levenberg-Marquardt damping that its last step got through with
-    # (sum M, N + 1) that its last step was made with; None before any
+    # (K,) of companions, likewise weighted
+    companion_residuals: FloatArray = field(default_factory=lambda: np.zeros(0), repr=False)
+    # (sum M + K, N + 1) that its last step was made with; None before any
     jacobian: FloatArray | None = field(default=None, repr=False)
     converged: bool = False  # whether the last step changed next to nothing
 
     @cached_property
     def residual(self) -> FloatArray:
-        """(sum M,) noise-weighted misfit of all sheets' data."""
-        return np.concatenate(list(self.residuals.values()))
+        """(sum M + K,) noise-weighted misfit of all sheets' data, and of companions."""
+        return np.concatenate([*self.residuals.values(), self.companion_residuals])
 
     @cached_property
     def misfit(self) -> float:
@@ -197,6 +203,7 @@ class FieldFit:
             fitted.drawing,
             *self._compared(fitted, measured),
             fitted.background,
+            measured,
         )
         return replace(judged, damping=1.0 if fitted.converged else fitted.damping)
 
@@ -230,7 +237,7 @@ class FieldFit:
                 return None
             solutions[name], residuals[name] = made
         return self._judged(
-            family, parameters, log_ratio, drawing, solutions, residuals, background
+            family, parameters, log_ratio, drawing, solutions, residuals, background, measured
         )
 
     def _pressed(self, name: Channel, drawing: Drawing, log_ratio: float) -> Pressed:
@@ -257,12 +264,27 @@ class FieldFit:
         solutions: Mapping[Channel, Solution],
         residuals: Mapping[Channel, FloatArray],
         background: Background | None,
+        measured: Measured,
     ) -> FittedField:
         off = (log_ratio - self.likely) / self._ratio_sigma
         away = _away(family, parameters) + (0.0 if background is None else background.away)
-        cost = float(sum(each @ each for each in residuals.values()) + away + off**2)
+        felt = np.zeros(0)
+        if isinstance(measured, SheetsAndCompanions):
+            weights, readings = measured.rows
+            felt = _felt(weights, drawing) - readings
+            if background is not None:
+                felt = felt + _felt(weights, background.drawing)
+        cost = sum(each @ each for each in residuals.values()) + felt @ felt + away + off**2
         return FittedField(
-            family, parameters, log_ratio, drawing, solutions, residuals, cost, background
+            family,
+            parameters,
+            log_ratio,
+            drawing,
+            solutions,
+            residuals,
+            float(cost),
+            background,
+            companion_residuals=felt,
         )
 
     def background(
@@ -296,7 +318,7 @@ class FieldFit:
             if areas is None:
                 return None
             sheets[name] = areas
-        return Background(others, frozen, sheets, _away(others, frozen))
+        return Background(others, frozen, drawing, sheets, _away(others, frozen))
 
     def _compared(
         self, fitted: FittedField, measured: Measured
@@ -318,7 +340,7 @@ class FieldFit:
         """Derivative of the weighted residual by the parameters and the log ratio.
 
         Returns:
-            (sum M, N + 1).
+            (sum M + K, N + 1), with K companions.
         """
         drawing = drawing or fitted.drawing
         slopes = drawing.slopes()
@@ -333,6 +355,11 @@ class FieldFit:
                 _for_c(by_pressure),
             )
             sheets.append(by_parameter)
+        if isinstance(measured, SheetsAndCompanions):
+            by_pressed = slopes[2].T * drawing.pressure_kpa + slopes[3].T * drawing.share
+            weights = measured.rows[0][:, drawing.nodes]
+            by_ratio = np.zeros((len(weights), 1))  # the same field, whatever a sheet makes of it
+            sheets.append(np.hstack([weights @ by_pressed.T, by_ratio]))
         return np.concatenate(sheets)
 
     def jacobian_at_onset(self, fitted: FittedField, measured: Measured) -> FloatArray:
@@ -435,6 +462,11 @@ def bounded_step(
     step = -np.linalg.solve(damped, gradient)
     step *= min(1.0, STEP_LIMIT / max(float(np.abs(step).max(initial=0.0)), 1e-12))
     return np.asarray(step)
+
+
+def _felt(weights: FloatArray, drawing: Drawing) -> FloatArray:
+    """Weighted forces (K,) that companions feel of a drawing; `weights` (K, P) by 1 kPa."""
+    return np.asarray(weights[:, drawing.nodes] @ (drawing.share * drawing.pressure_kpa))
 
 
 def _for_c(array: FloatArray) -> FloatArray:

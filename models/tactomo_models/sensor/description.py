@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import BoolArray, FloatArray, Image, IntArray
+from tactomo_models.sensor.companion import Companion
 from tactomo_models.sensor.mount import Mount
 from tactomo_models.sensor.outline import Pad, RimElectrode
 from tactomo_models.sensor.pattern import Pairs, combined, ring_pairs
@@ -26,6 +27,8 @@ PairList = Annotated[
     tuple[Annotated[tuple[Electrode, Electrode], Field(strict=False)], ...],
     Field(min_length=1, max_length=256, strict=False),
 ]
+
+CompanionName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,62}$")]
 
 MAX_TABLE_BYTES = 2_000_000_000
 """Of a sensor's influence tables, which grow as the square of the map's nodes."""
@@ -125,6 +128,7 @@ class SensorDescription(Section):
     magnitude: MagnitudeChannel | None = None
     structure: StructureChannel | None = None
     mount: Mount | None = None
+    companion: Annotated[dict[CompanionName, Companion], Field(max_length=16, default_factory=dict)]
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Self:
@@ -236,6 +240,9 @@ class SensorDescription(Section):
         if not isinstance(other, SensorDescription):
             return NotImplemented
         return self is other or self.model_dump() == other.model_dump()
+
+    def __hash__(self) -> int:
+        return hash(self.sha256)
 
     @cached_property
     def pairs(self) -> Pairs:

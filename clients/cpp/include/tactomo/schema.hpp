@@ -12,9 +12,9 @@
 namespace tactomo {
 
 /// Flags under which every touch is still seen: see STREAM.md. Of any other nobody knows.
-inline constexpr std::array<std::string_view, 6> touches_seen{
-    "channels_skewed", "electrode_fault", "invalid_voltage", "magnitude_missing", "saturated",
-    "untaught"};
+inline constexpr std::array<std::string_view, 8> touches_seen{
+    "channels_skewed", "companion_disputed", "companion_missing", "electrode_fault",
+    "invalid_voltage", "magnitude_missing", "saturated", "untaught"};
 
 /// Whether Contact::pressure_kpa can be believed, and what its absence means.
 enum class PressureRange { unknown, within, below, above };

@@ -103,7 +103,8 @@ def reconstruct(
     missing, 4 invalid voltage, 8 no reference, 16 misfit high, 32 not converged, 64 reference
     mismatch, 128 electrode fault, 256 noise high, 512 channels swapped, 1024 saturated,
     2048 low confidence, 4096 channels skewed and 16384 reference disputed (live only), 8192 no
-    usable scan, 32768 untaught, 65536 creeping (live only).
+    usable scan, 32768 untaught, 65536 creeping (live only),
+    131072 companion missing, 262144 companion disputed.
 
     Methods: *tikhonov* and *noser* are one linear step, regularised so that the image is as noisy,
     relative to its signal, as the scans are (noise figure 1); *fit* models a few contacts,

@@ -1,0 +1,63 @@
+"""What companions say of a frame: forces, and the rows that they add to the sheets' data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from tactomo_protocol import Channel
+
+from tactomo_models.arrays import FloatArray
+from tactomo_models.scans.changes import Changes
+
+DISPUTED = 4.0  # standard uncertainties apart: by chance once in 16,000 independent readings
+
+
+@dataclass(frozen=True)
+class CompanionForce:
+    """What one companion reads of a frame."""
+
+    force_n: float  #: since the tare
+    sigma_n: float  #: its standard uncertainty
+    #: (P,) what one kPa at each pressable node adds: the companion feels n_per_kpa @ pressure
+    n_per_kpa: FloatArray
+
+    def agrees_with(self, force_n: float, sigma_n: float = 0.0) -> bool:
+        """Whether a force of that standard uncertainty may be the same."""
+        return abs(force_n - self.force_n) <= DISPUTED * float(np.hypot(self.sigma_n, sigma_n))
+
+
+class SheetsAndCompanions(dict[Channel, Changes]):
+    """The changes of each channel, with the forces of companions that are fitted beside them."""
+
+    def __init__(
+        self, changes: Mapping[Channel, Changes], companions: Mapping[str, CompanionForce]
+    ) -> None:
+        super().__init__(changes)
+        self.companions = companions
+
+    @cached_property
+    def inflation(self) -> float:
+        """The mean variance inflation of the voltages.
+
+        The cost counts each voltage as independent, the evidence fewer of them. Companions are
+        counted up by as much in the cost, so that they weigh the same beside the sheets in both.
+        """
+        independent = [(each.weight > 0) / each.variance_inflation for each in self.values()]
+        valid = sum(np.count_nonzero(each.weight) for each in self.values())
+        return valid / max(float(np.concatenate(independent).sum()), 1.0)
+
+    @cached_property
+    def rows(self) -> tuple[FloatArray, FloatArray]:
+        """Weighted forces (K, P) of one kPa at each node, and weighted readings (K,)."""
+        each = self.companions.values()
+        weight = np.sqrt(self.inflation) / np.array([one.sigma_n for one in each])
+        n_per_kpa = np.array([one.n_per_kpa for one in each])
+        return weight[:, None] * n_per_kpa, weight * np.array([one.force_n for one in each])
+
+
+def companions_of(measured: Mapping[Channel, Changes]) -> Mapping[str, CompanionForce]:
+    """The companions that are fitted beside the sheets."""
+    return measured.companions if isinstance(measured, SheetsAndCompanions) else {}

@@ -1,0 +1,35 @@
+"""Companions: scalars that feel the pressure field as the sheets do, such as a load cell below."""
+
+from __future__ import annotations
+
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from tactomo_models.sensor.section import Section
+from tactomo_models.sensor.sheet import Ring
+
+
+class Companion(Section):
+    """A scalar that tells the force on the whole sheet, or on the part inside `region_m`.
+
+    The force in newtons is gain_n_per_unit * (reading - offset). The offset counts where the tare
+    has no readings of its own. A reading outside `limits` says that the device has clipped.
+    """
+
+    gain_n_per_unit: Annotated[float, Field(ge=-1e9, le=1e9)]
+    offset: float = 0.0
+    noise_n: Annotated[float, Field(gt=0, le=1e6)]
+    relative_error: Annotated[float, Field(ge=0, le=1)] = 0.0
+    limits: Annotated[tuple[float, float] | None, Field(strict=False)] = None
+    region_m: Ring | None = None
+
+    @model_validator(mode="after")
+    def _tells_a_force(self) -> Self:
+        if self.gain_n_per_unit == 0:
+            raise ValueError("gain_n_per_unit = 0: give the newtons of one unit of the reading")
+        if self.limits is not None and self.limits[0] >= self.limits[1]:
+            raise ValueError(
+                f"limits = {list(self.limits)}: give the least reading, then the largest"
+            )
+        return self

@@ -1,0 +1,155 @@
+"""A load cell beside the sheets: what it decides, and what becomes of one that is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from noisy_skin import Skin
+from tactomo_models import (
+    Channel,
+    DataError,
+    Flag,
+    Press,
+    Reconstructor,
+    SensorDescription,
+    SkinSimulator,
+    load_description,
+)
+from tactomo_models.arrays import FloatArray
+from tactomo_models.batch import reconstruct_file
+from tactomo_models.methods.method import Skin as Prepared
+from tactomo_models.methods.search import Search
+from tactomo_models.scans.companion_forces import SheetsAndCompanions
+from tactomo_models.scene.field_fit import FieldFit
+from tactomo_models.scene.parameters import COLUMNS, EDGE, PEAK, SIZE, X
+from tactomo_models.scene.reconstruction import Reconstruction
+from variants import variant
+
+BALL = Press(0.0, 0.0, 180.0, 0.015, profile="dome")
+BALL_N = 2 / 3 * 180e3 * np.pi * 0.015**2
+CELL = {"gain_n_per_unit": 2.0, "offset": 5.0, "noise_n": 0.5, "limits": [0.0, 400.0]}
+
+
+@pytest.fixture(scope="module")
+def sensor() -> SensorDescription:
+    """One graded sheet, with a load cell that reads half newtons from 5 on."""
+    return variant(load_description("graded_square"), companion={"load_cell": CELL})
+
+
+@pytest.fixture(scope="module")
+def skin(sensor: SensorDescription) -> Skin:
+    return Skin(SkinSimulator(sensor, spacing_m=0.0022))
+
+
+@pytest.fixture(scope="module")
+def reconstructor(sensor: SensorDescription, skin: Skin) -> Reconstructor:
+    made = Reconstructor(sensor, budget_s=2.0)
+    made.set_reference(skin.reference())
+    return made
+
+
+@pytest.fixture(scope="module")
+def scan(skin: Skin) -> FloatArray:
+    return skin.scan(BALL)["magnitude"]
+
+
+def cold(reconstructor: Reconstructor, scan: FloatArray, force_n: float | None) -> Reconstruction:
+    reconstructor.reset()
+    companions = None if force_n is None else [("load_cell", force_n / 2 + 5)]
+    return reconstructor.reconstruct(scan, None, companions=companions)
+
+
+def test_a_force_is_surer_with_a_load_cell(reconstructor: Reconstructor, scan: FloatArray) -> None:
+    alone, both = (cold(reconstructor, scan, force_n) for force_n in (None, BALL_N))
+    assert not alone.flags & (Flag.COMPANION_MISSING | Flag.COMPANION_DISPUTED)
+    assert not both.flags
+    assert both.force_n == pytest.approx(BALL_N, rel=0.02)
+    off = [abs(frame.contacts[0].peak_kpa - 180) for frame in (alone, both)]
+    assert off[1] < 18 < off[0]  # right to 10 %, as `tactomo evaluate field` counts
+    # Flat or falling, the sheet alone does not tell, and a falling pressure has no bound.
+    assert np.isnan(alone.force_sigma_n)
+    assert both.force_sigma_n < 0.01 * BALL_N
+
+
+@pytest.mark.parametrize("factor", [0.0, 3.0])
+def test_a_load_cell_that_contradicts_the_sheet_is_named_and_left_out(
+    reconstructor: Reconstructor, scan: FloatArray, factor: float
+) -> None:
+    alone, wrong = (cold(reconstructor, scan, force_n) for force_n in (None, factor * BALL_N))
+    assert Flag.COMPANION_DISPUTED in wrong.flags
+    assert "companion load_cell reads" in wrong.reason
+    assert wrong.force_n == pytest.approx(alone.force_n, rel=1e-6)
+    again = reconstructor.reconstruct(scan, None, companions=[("load_cell", BALL_N / 2 + 5)])
+    assert not again.flags & Flag.COMPANION_DISPUTED  # it is believed once it agrees
+
+
+@pytest.mark.parametrize("reading", [np.nan, 400.5, -0.1])
+def test_a_reading_beyond_its_limits_is_none(
+    reconstructor: Reconstructor, scan: FloatArray, reading: float
+) -> None:
+    measurement = reconstructor.compare(scan, None, companions=[("load_cell", reading)])
+    assert not measurement.companions
+    assert Flag.COMPANION_MISSING in measurement.flags
+
+
+def test_a_companion_feels_its_region_alone(sensor: SensorDescription) -> None:
+    half = [[0.0, -0.1], [0.1, -0.1], [0.1, 0.1], [0.0, 0.1]]
+    right = variant(sensor, companion={"load_cell": {**CELL, "region_m": half}})
+    of_all, of_half = (
+        Prepared.of(each).tare.sensor.companion_weights["load_cell"].sum()
+        for each in (sensor, right)
+    )
+    # 1 kPa on the sheet that can be pressed, and on half of it but for a row of nodes
+    assert of_half / of_all == pytest.approx(0.5, abs=0.02)
+
+
+def test_the_jacobian_of_a_companion_is_its_derivative(
+    reconstructor: Reconstructor, scan: FloatArray
+) -> None:
+    measurement = reconstructor.compare(scan, None, companions=[("load_cell", 40.0)])
+    assert isinstance(measurement.data, SheetsAndCompanions)
+    fit = FieldFit(Prepared.of(reconstructor.description).forward, reconstructor.description)
+    each = np.zeros((1, COLUMNS))
+    each[0, [X, SIZE, PEAK, EDGE]] = 0.3, np.log(0.013), 0.6, 0.5
+    family = Search(fit).field.of(each)
+
+    def residual(parameters: FloatArray) -> FloatArray:
+        fitted = fit.evaluate(family, parameters, fit.likely, measurement.data)
+        assert fitted is not None
+        return fitted.companion_residuals
+
+    at = family.join(each)
+    fitted = fit.evaluate(family, at, fit.likely, measurement.data)
+    assert fitted is not None
+    J = fit.jacobian(fitted, measurement.data)
+    assert len(J) == len(fitted.residual) == len(measurement.changes[Channel.MAGNITUDE].change) + 1
+    step = 1e-6 * np.random.default_rng(1).standard_normal(len(at))
+    change = residual(at + step) - residual(at - step)
+    np.testing.assert_allclose(change, 2 * J[-1:, :-1] @ step, rtol=1e-4)
+
+
+def test_a_file_gives_readings_at_rest_and_of_each_frame(
+    tmp_path: Path, sensor: SensorDescription, skin: Skin, scan: FloatArray
+) -> None:
+    rest = skin.reference()
+    arrays: dict[str, Any] = {
+        "magnitude": np.array([scan, scan]),
+        "magnitude_reference": rest.magnitude,
+        "companion_load_cell": np.array([BALL_N / 2 + 11, np.nan]),
+        "companion_load_cell_reference": np.array([10.0, 12.0]),
+    }
+    source, target = tmp_path / "in.npz", tmp_path / "out.npz"
+    np.savez(source, **arrays)
+    reconstruct_file(source, target, description=sensor)
+    with np.load(target) as out:
+        assert out["force_n"][0] == pytest.approx(BALL_N, rel=0.02)
+        assert [bool(Flag.COMPANION_MISSING & int(flags)) for flags in out["flags"]] == [
+            False,
+            True,
+        ]
+    np.savez(source, **{**arrays, "companion_load_cell": np.zeros(3)})
+    with pytest.raises(DataError, match="3 readings of 2 frames"):
+        reconstruct_file(source, target, description=sensor)
