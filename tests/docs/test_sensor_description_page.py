@@ -21,6 +21,7 @@ TABLES = {
     "`[magnitude.response]`": "MagnitudeResponse",
     "`[structure]`": "StructureChannel",
     "`[structure.response]`": "StructureResponse",
+    "`[companion.NAME]`": "Companion",
     "`[mount]`": "Mount",
     "`[mount.plane]`": "PlaneMount",
     "`[mount.cylinder]`": "CylinderMount",

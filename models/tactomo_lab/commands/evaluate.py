@@ -242,7 +242,7 @@ def moving(
         "tactomo evaluate field --rows soft,graded --method fit --count 30",
         "tactomo evaluate field --seeds reporting --count 50 --json > field.json",
         "tactomo evaluate field --rows soft --picture soft_press.png",
-        "tactomo evaluate field --rows graded,mixed --companion 0.05 --json > companion.json",
+        "tactomo evaluate field --rows graded,mixed --companion 0.05",
     )
 )
 def field(

@@ -10,7 +10,7 @@ const SOON_S = 10;            // after its start a daemon may wait for its ports
 const CURRENT = ["taring", "ended", "replay-paused", "issue"];
 
 // Flags under which every touch is still seen (clients/STREAM.md); of any other nobody knows.
-const TOUCHES_SEEN = ["magnitude_missing", "invalid_voltage", "electrode_fault", "saturated", "channels_skewed", "untaught"];
+const TOUCHES_SEEN = ["magnitude_missing", "invalid_voltage", "electrode_fault", "saturated", "channels_skewed", "untaught", "companion_missing", "companion_disputed"];
 
 /** Whether no contacts in a fresh frame means that nothing presses. */
 export function areTouchesSeen(frame) {
