@@ -17,27 +17,27 @@ _NO_FIGURE = "as promised"
 _PAGE = """\
 # Reliability
 
-What is done to the daemon, what it promises then, how that was tried, and what came of it. Written
-by `make faults`, which runs all of it again on the machine at hand ({minutes} minutes); do not edit
-it. Every fault is done to a real `tactomo daemon` process on real pseudo-terminals and real ZeroMQ
-sockets. The tests are in `tests/faults`; a row is a test. A part of them (`make soak`, `-k`) writes
-its own rows anew. Long measures say at which scale (`--scale`) they were done.
+`make faults` writes this page ({minutes} minutes): do not edit the page. Each row is a test in
+`tests/faults` of a real `tactomo daemon` process on real pseudo-terminals and ZeroMQ sockets: the
+fault, the promise, the method and the result. `make soak` and `-k` write their own rows anew.
+Long measures state their scale (`--scale`).
 
-What holds:
+These promises hold:
 
-- Frames are back within a second of cables pulled, boards restarted or exchanged, silence, noise.
-- No frame is made of damaged bytes; each intact scan is published, or counted as dropped.
-- Memory, threads and descriptors stay as they are over a million scans, and many subscribers.
-- Boards that say absurd things, files that nobody means well with and hostile pages end nothing.
-- A frozen converter, a second skin on one daemon and a tare under a press are told, not believed.
+- Frames return within a second after pulled cables, restarted or exchanged boards, silence, noise.
+- No frame contains damaged bytes; each intact scan is published, or counted as dropped.
+- Memory, threads and descriptors stay constant over a million scans and many subscribers.
+- Hostile boards, files and web pages never end the daemon.
+- A frozen converter, a second skin on one daemon and a tare under a press are reported.
 
-What does not:
+These limits remain:
 
-- Latency is not promised: beside busy loops it is tens of milliseconds, and scans are dropped.
-- A kill loses up to 0.25 s of a recording; a full disk ends one to a file, one to a folder waits.
-- A converter frozen at the very first tare, or something on the skin then, cannot be told from
-  a skin at rest ([what to do](your_own_sensor.md)).
-- A wide press that comes lightly may show as none for its first frames.
+- Latency is not guaranteed: on a busy computer it is tens of milliseconds, and scans are dropped.
+- A kill loses up to 0.25 s of a recording. A full disk ends a recording to a file, and pauses a
+  recording to a folder.
+- At the very first tare, a frozen converter or an object on the skin looks like a skin at rest
+  ([what to do](your_own_sensor.md)).
+- A wide press that begins lightly may be missing in its first frames.
 
 Machine: {machine}.
 

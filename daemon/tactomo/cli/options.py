@@ -127,7 +127,7 @@ ReferenceFrames: TypeAlias = Annotated[
 ]
 GivenChannel: TypeAlias = Annotated[
     Literal["magnitude", "structure"] | None,
-    typer.Option(help="Which channel a file of one is of. [the sensor's only one]"),
+    typer.Option(help="Channel of a file with one channel. [the sensor's only one]"),
 ]
 Sensor: TypeAlias = Annotated[
     str | None,
@@ -145,7 +145,7 @@ Address: TypeAlias = Annotated[
         "--address",
         "-a",
         envvar="TACTOMO_ADDRESS",
-        help="Of its stream, such as tcp://robot:5560. [found on this computer]",
+        help="Address of the stream, such as tcp://robot:5560. [found on this computer]",
         show_envvar=False,
     ),
 ]
@@ -168,7 +168,7 @@ ViewerPort: TypeAlias = Annotated[
         "--viewer-port",
         min=0,
         max=65535,
-        help=f"Of the page; 0 takes a free one. [{DEFAULT_VIEWER_PORT}, or the next that is free]",
+        help=f"Port of the page; 0 takes a free port. [{DEFAULT_VIEWER_PORT}, or the next free]",
     ),
 ]
 KeysFolder: TypeAlias = Annotated[
@@ -192,7 +192,7 @@ Pose: TypeAlias = Annotated[
     typer.Option(metavar="X,Y,Z[,ROLL,PITCH,YAW]", help="Pose in that frame, metres and degrees."),
 ]
 Force: TypeAlias = Annotated[
-    bool, typer.Option("--force", "-f", help="Write over a file that is there, without asking.")
+    bool, typer.Option("--force", "-f", help="Overwrite an existing file without asking.")
 ]
 RecordingFile: TypeAlias = Annotated[Path, typer.Argument(help="A recording (.mcap).")]
 

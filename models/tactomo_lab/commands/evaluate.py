@@ -68,7 +68,7 @@ SnrOf = Annotated[
 app = options.typer_app(
     name="evaluate",
     cls=Group,
-    help="Measure how right the reconstruction is, where the truth is known.",
+    help="Measure the accuracy of reconstructions on data with known truth.",
     no_args_is_help=True,
 )
 
@@ -390,7 +390,7 @@ def stability(
         str | None, typer.Option(help="Which regimes, with commas. [all of them]")
     ] = None,
     method: Annotated[list[str] | None, options.methods_option(" [all that are available]")] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes that share the work.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
     sensor: options.Description = options.DEFAULT_DESCRIPTION,
     picture: Annotated[Path | None, picture_option("Draw an overview")] = None,
     as_json: options.JsonOutput = False,

@@ -240,7 +240,7 @@ def measured(
     ] = None,
     sensor: Annotated[
         str | None,
-        typer.Option("--description", "-d", help="Sensor of FILE. [that of the public set]"),
+        typer.Option("--description", "-d", help="Sensor of FILE. [the public set's]"),
     ] = None,
     as_json: JsonOutput = False,
 ) -> None:
@@ -363,10 +363,10 @@ def _mean(values: Sequence[float]) -> float:
     )
 )
 def ktc(
-    file: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Tanks, see above.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Tanks (format above).")],
     level: Annotated[
         int | None,
-        typer.Option(min=1, max=7, help="Lose the electrodes that this level has lost, too."),
+        typer.Option(min=1, max=7, help="Leave out the electrodes that this level has lost."),
     ] = None,
     sensor: Description = "tank_ktc2023",
     picture: Picture = None,
@@ -415,7 +415,7 @@ def ktc(
     )
 )
 def presses(
-    skins: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Presses, see above.")],
+    skins: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Presses (format above).")],
     train: Annotated[int, typer.Option(min=1, help="Presses to learn from.")] = 200,
     as_json: JsonOutput = False,
 ) -> None:

@@ -42,7 +42,7 @@ app = typer_app()
     )
 )
 def simulate(
-    folder: Annotated[Path, typer.Argument(help="Where the scenes go; made if missing.")],
+    folder: Annotated[Path, typer.Argument(help="Folder for the scenes; made if missing.")],
     preset: Annotated[
         Literal["paper", "robust"],
         typer.Option(
@@ -52,7 +52,7 @@ def simulate(
     scenes: Annotated[
         int | None, typer.Option(min=1, help="How many. [paper: 12000, robust: 24000]")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the whole set.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the whole set.")] = 0,
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Processes. [one for each core]", show_default=False)
     ] = None,
@@ -103,7 +103,7 @@ def simulate(
 def train(
     folder: Annotated[Path, typer.Argument(help="Scenes, from `tactomo models simulate`.")],
     configuration: Annotated[
-        ConfigurationName, typer.Option(help="Which network, see above.")
+        ConfigurationName, typer.Option(help="The network (names above).")
     ] = "ours",
     epochs: Annotated[
         int | None, typer.Option(min=1, help="Passes over the scenes. [the configuration's]")
@@ -118,8 +118,8 @@ def train(
         Path | None,
         typer.Option(help="Begin with the weights of this checkpoint."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of weights, order, noise and turns.")] = 0,
-    device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What computes.")] = "cpu",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of weights, order, noise and turns.")] = 0,
+    device: Annotated[Literal["cpu", "cuda"], typer.Option(help="Device that computes.")] = "cpu",
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Processes and threads. [one for each core]")
     ] = None,
@@ -128,7 +128,7 @@ def train(
         typer.Option("--output", "-o", help="The network. [the cache, where tactomo looks]"),
     ] = None,
     checkpoint: Annotated[
-        Path | None, typer.Option(help="What to go on from. [FOLDER/RECIPE.pt]")
+        Path | None, typer.Option(help="Network to continue from. [FOLDER/RECIPE.pt]")
     ] = None,
     sensor: Description = DEFAULT_DESCRIPTION,
     as_json: JsonOutput = False,
@@ -189,10 +189,10 @@ def train(
     ),
 )
 def train_tanks(
-    folder: Annotated[Path, typer.Argument(help="Where the scenes go; made if missing.")],
+    folder: Annotated[Path, typer.Argument(help="Folder for the scenes; made if missing.")],
     scenes: Annotated[int, typer.Option(min=TANKS_IN_SHARD, help="How many tanks.")] = 2500,
     steps: Annotated[int, typer.Option(min=20, help="Batches of twenty.")] = 3600,
-    seed: Annotated[int, typer.Option(min=0, help="Of weights, noise and turns.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of weights, noise and turns.")] = 0,
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Processes. [one for each core]", show_default=False)
     ] = None,

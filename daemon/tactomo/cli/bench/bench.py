@@ -122,7 +122,7 @@ def bench(
         typer.Option(
             "--show",
             rich_help_panel=SPEED,
-            help="With --machine-speed: only show what such a daemon would go by.",
+            help="With --machine-speed: only show the speed in use.",
         ),
     ] = False,
     as_json: options.JsonOutput = False,

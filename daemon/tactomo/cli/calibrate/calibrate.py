@@ -42,10 +42,12 @@ app = options.typer_app(
 )
 
 DiameterMm = Annotated[
-    float | None, typer.Option("--diameter-mm", min=1.0, max=1e3, help="Of a round, flat indenter.")
+    float | None,
+    typer.Option("--diameter-mm", min=1.0, max=1e3, help="Diameter of a round, flat indenter."),
 ]
 AreaMm2 = Annotated[
-    float | None, typer.Option("--area-mm2", min=1.0, max=1e6, help="Of one of another shape.")
+    float | None,
+    typer.Option("--area-mm2", min=1.0, max=1e6, help="Area of an indenter of another shape."),
 ]
 Output = Annotated[
     Path | None,
@@ -93,11 +95,12 @@ def live(
 )
 def fit(
     readings: Annotated[
-        Path, typer.Argument(metavar="FILE.csv", help="What the load cell said, see above.")
+        Path, typer.Argument(metavar="FILE.csv", help="The load cell's log (columns above).")
     ],
     sensor: options.Sensor = None,
     recording: Annotated[
-        Path | None, typer.Option(metavar="FILE.mcap", help="What the sensor said meanwhile.")
+        Path | None,
+        typer.Option(metavar="FILE.mcap", help="The sensor's recording of the same time."),
     ] = None,
     diameter_mm: DiameterMm = None,
     area_mm2: AreaMm2 = None,
@@ -107,13 +110,13 @@ def fit(
     description: options.GivenDescription = None,
     device_id: Annotated[
         list[str] | None,
-        typer.Option(help="The device that it was made with, where no recording says; repeat."),
+        typer.Option(help="Device of the calibration, without a recording; repeat."),
     ] = None,
     picture: Picture = None,
     output: Output = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Keep nothing.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Do not keep the result.")] = False,
     keep_odd: Annotated[
-        bool, typer.Option("--keep-odd", help="Keep it with lines that the others contradict.")
+        bool, typer.Option("--keep-odd", help="Keep lines that the other lines contradict.")
     ] = False,
     address: options.Address = None,
     keys: options.KeysFolder = None,

@@ -42,7 +42,7 @@ Output = Annotated[
     typer.Option("--output", "-o", help="Keep it in this file. [where the daemon looks]"),
 ]
 KeepOdd = Annotated[
-    bool, typer.Option("--keep-odd", help="Learn also from presses that the others contradict.")
+    bool, typer.Option("--keep-odd", help="Keep presses that the other presses contradict.")
 ]
 
 
@@ -55,7 +55,7 @@ def live(
     sensor: options.Sensor = None,
     presses: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.npz", help="Presses are kept here. [beside what is taught]"),
+        typer.Option(metavar="FILE.npz", help="File for the presses. [beside the taught model]"),
     ] = None,
     description: options.GivenDescription = None,
     output: Output = None,
@@ -84,14 +84,14 @@ def live(
     )
 )
 def fit(
-    presses: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Presses, see above.")],
+    presses: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Presses (format above).")],
     sensor: options.Sensor = None,
     description: options.Description = options.DEFAULT_DESCRIPTION,
     device_id: Annotated[
-        list[str] | None, typer.Option(help="The device that it was made with; repeat.")
+        list[str] | None, typer.Option(help="Device of the calibration; repeat.")
     ] = None,
     output: Output = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Keep nothing.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Do not keep the result.")] = False,
     keep_odd: KeepOdd = False,
     address: options.Address = None,
     keys: options.KeysFolder = None,

@@ -71,13 +71,13 @@ def doctor(
     ] = None,
     frames: Annotated[
         str | None,
-        typer.Option(metavar="FIRST:END", help="Of a file: the scans at rest. [the stillest]"),
+        typer.Option(metavar="FIRST:END", help="Scans at rest of a file. [the stillest]"),
     ] = None,
     array: Annotated[
-        str | None, typer.Option(help="Of an .npz file: the array of scans at rest.")
+        str | None, typer.Option(help="Array of an .npz file with scans at rest.")
     ] = None,
     lookup: Annotated[
-        str, typer.Option(help="Of an .npz file: the array that says how voltages are ordered.")
+        str, typer.Option(help="Array of an .npz file with the order of voltages.")
     ] = "lookup",
     as_json: options.JsonOutput = False,
     keys: options.KeysFolder = None,

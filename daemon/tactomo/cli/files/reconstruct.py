@@ -43,7 +43,9 @@ def reconstruct(
     description: Description = DEFAULT_DESCRIPTION,
     calibration: Annotated[
         Path | None,
-        typer.Option(help="Of pressure, by `tactomo calibrate`. [the description's response]"),
+        typer.Option(
+            help="Pressure calibration, from `tactomo calibrate`. [the description's response]"
+        ),
     ] = None,
     taught: Annotated[
         Path | None, typer.Option(help="By `tactomo teach`: corrects where single contacts are.")

@@ -26,11 +26,11 @@ MARGIN_S = 30.0  # how much earlier or later than it was acquired a frame may ha
 
 
 FromOption = Annotated[
-    float, typer.Option("--from", min=0.0, metavar="SECONDS", help="Leave out what was before.")
+    float, typer.Option("--from", min=0.0, metavar="SECONDS", help="Leave out everything before.")
 ]
 ToOption = Annotated[
     float | None,
-    typer.Option("--to", min=0.0, metavar="SECONDS", help="Leave out what was after. [the end]"),
+    typer.Option("--to", min=0.0, metavar="SECONDS", help="Leave out everything after. [the end]"),
 ]
 
 

@@ -66,7 +66,7 @@ def build(
 
 @app.command(epilog=examples("tactomo models copy sciospec_disc tank.toml"))
 def copy(
-    name: Annotated[str, typer.Argument(help="Of those that `tactomo models list` shows.")],
+    name: Annotated[str, typer.Argument(help="A name from `tactomo models list`.")],
     path: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The file to write.")],
 ) -> None:
     """Copy a shipped sensor description to a file of your own, to be changed there."""

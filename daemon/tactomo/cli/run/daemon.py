@@ -45,7 +45,7 @@ def daemon(
     protocol: options.GivenProtocol = None,
     method: options.GivenMethod = None,
     budget_ms: Annotated[
-        float | None, typer.Option(help="Time that one reconstruction may take. [the method's own]")
+        float | None, typer.Option(help="Time per frame. [the method's own]")
     ] = None,
     stream: Annotated[
         str | None, typer.Option(help=f"Where to publish. [{options.DEFAULT_STREAM}]")
@@ -130,7 +130,8 @@ def replay(
     ] = None,
     description: options.RecordedDescription = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="Of pressure, by `tactomo calibrate`. [the recorded one]")
+        Path | None,
+        typer.Option(help="Pressure calibration, from `tactomo calibrate`. [the recorded one]"),
     ] = None,
     method: options.Method = "auto",
     stream: options.ServeStream = None,
@@ -140,9 +141,9 @@ def replay(
         bool, typer.Option("--stay", help="Keep running after the recording's end.")
     ] = False,
     start: Annotated[
-        float, typer.Option(min=0.0, help="Begin so many seconds after its beginning.")
+        float, typer.Option(min=0.0, help="Start, seconds after the recording's beginning.")
     ] = 0.0,
-    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="Restart at the end.")] = False,
     paused: Annotated[bool, typer.Option("--paused", help="Wait for the page's Play.")] = False,
     wait_for_page: Annotated[bool, typer.Option("--wait-for-page", hidden=True)] = False,
     record: Annotated[

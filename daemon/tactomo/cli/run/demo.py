@@ -50,7 +50,9 @@ def demo(
     noise_uv: Annotated[
         float | None, typer.Option(min=0.0, help="Converter noise, µV rms.")
     ] = None,
-    record: Annotated[Path | None, typer.Option(help="Record what the ports say.")] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="Record the ports' bytes to this file.")
+    ] = None,
     viewer_port: options.ViewerPort = None,
     stream: options.ServeStream = None,
     control: options.ServeControl = None,

@@ -34,7 +34,7 @@ app = typer_app()
 )
 def ports(
     paths: Annotated[
-        list[str] | None, typer.Argument(metavar="[PORT]...", help="These alone. [all adapters]")
+        list[str] | None, typer.Argument(metavar="[PORT]...", help="Ports to list. [all adapters]")
     ] = None,
     ask: Annotated[
         bool,
@@ -51,7 +51,7 @@ def ports(
         ),
     ] = None,
     baud: Annotated[
-        int | None, typer.Option(min=1200, help="To ask at; USB takes any. [the protocol's usual]")
+        int | None, typer.Option(min=1200, help="Baud rate; USB takes any. [the protocol's usual]")
     ] = None,
     as_json: JsonOutput = False,
 ) -> None:

@@ -41,7 +41,8 @@ def twin(
         typer.Option(min=0.0, help="Converter noise, µV rms. [60 dB below the signal]"),
     ] = None,
     unevenness: Annotated[
-        float, typer.Option(min=0.0, max=0.5, help="Of the sheet's conductivity; 0.05 is 5 %.")
+        float,
+        typer.Option(min=0.0, max=0.5, help="Unevenness of the sheet's conductivity; 0.05 is 5 %."),
     ] = 0.03,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal noise and drift.")] = 0,
     twin_control: Annotated[

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tactomo.service.installation import Plan
 
 app = typer_app(
-    help="Let systemd run a skin's daemon: at boot, for good, and locked in.",
+    help="Let systemd run a skin's daemon: at boot, restarted, in a sandbox.",
     name="service",
     no_args_is_help=True,
     epilog=examples(
@@ -26,12 +26,12 @@ app = typer_app(
 Name = Annotated[str, typer.Argument(help="The skin's name: left_forearm.")]
 Ports = Annotated[
     list[str],
-    typer.Option("--port", "-p", help="Its serial port, plugged in; twice for two boards."),
+    typer.Option("--port", "-p", help="The skin's serial port, plugged in; twice for two boards."),
 ]
 Root = Annotated[
     Path, typer.Option(help="Where the robot's disk is mounted, to prepare an image of it.")
 ]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Show what would be done; do nothing.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Show the steps without doing them.")]
 
 
 @app.command(

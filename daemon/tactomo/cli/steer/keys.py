@@ -43,12 +43,14 @@ Folder: TypeAlias = Annotated[
 ForServer: TypeAlias = Annotated[
     str, typer.Option("--for", help="The server: the name given to `make --server`.")
 ]
-Force: TypeAlias = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
+Force: TypeAlias = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 
 
 @app.command(epilog=examples("tactomo keys make left_forearm --server", "tactomo keys make desk"))
 def make(
-    name: Annotated[str, typer.Argument(help="What to call it, such as the sensor or the user.")],
+    name: Annotated[
+        str, typer.Argument(help="Name of the key pair, such as the sensor or the user.")
+    ],
     server: Annotated[
         bool, typer.Option("--server", help="For a daemon: with a list of clients.")
     ] = False,
@@ -97,7 +99,7 @@ def allow(
     public: Annotated[Path, typer.Argument(help="The client's public key, NAME.key.")],
     server: ForServer,
     may_command: Annotated[
-        bool, typer.Option("--may-command", help="It may use the control socket, too.")
+        bool, typer.Option("--may-command", help="The client may use the control socket, too.")
     ] = False,
     folder: Folder = None,
     force: Force = False,

@@ -125,9 +125,7 @@ def method(
             autocompletion=options.method_names,
         ),
     ],
-    budget_ms: Annotated[
-        float | None, typer.Option(min=0.1, help="Time that one reconstruction may take.")
-    ] = None,
+    budget_ms: Annotated[float | None, typer.Option(min=0.1, help="Time per frame.")] = None,
     sensor: options.Sensor = None,
     address: options.Address = None,
     keys: options.KeysFolder = None,
@@ -160,11 +158,13 @@ def method(
 def poke(
     command: Annotated[str, typer.Argument(help="A command of the twin, see below.")],
     arguments: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME=VALUE]...", help="Its arguments.")
+        list[str] | None, typer.Argument(metavar="[NAME=VALUE]...", help="The command's arguments.")
     ] = None,
     address: Annotated[
         str | None,
-        typer.Option("--address", "-a", help="Of the twin's control socket. [the only twin's]"),
+        typer.Option(
+            "--address", "-a", help="Address of the twin's control socket. [the only twin's]"
+        ),
     ] = None,
 ) -> None:
     """Press, move, release and break a running twin, as a test of your own robot would.
