@@ -11,16 +11,16 @@ Nothing here opens a port or a socket; what the daemon does live and what a rese
 offline run this same code. Its folders, in the order in which each builds on those before:
 
 ===============  =================================================================================
-sensor           what a skin is: pattern, sheet, response, its description and the file of it
+sensor           description of a skin and its file: pattern, sheet, response
 physics          mesh, forward model, artifacts, sensitivity, linear reconstruction matrices
-scans            from volts to changes: polarity, plausibility, reference
-scene            what presses: shapes, areas, contacts, pressure
-methods          how a frame is solved: one protocol, a registry, and a file for each method
-simulation       skins whose truth is known, and how they drift
+scans            from voltages to changes: polarity, plausibility, reference
+scene            shapes, areas, contacts and pressure of a scene
+methods          reconstruction methods: a protocol, a registry, a file for each method
+simulation       skins with known truth, and their drift
 calibration      pressure curves from a load cell
-health           what is wrong with a skin or its leads
+health           faults of a skin or its leads
 drift            a reference that follows the skin
-commissioning    one very skin: what it is taught, and whether something lies on it at a start
+commissioning    teaching one skin, and objects on that skin at a start
 simulators       the skin in MuJoCo and Gymnasium
 ===============  =================================================================================
 

@@ -45,9 +45,9 @@ PRESSURE_RANGES = ("unknown", "within", "below", "above")
 
 
 class Answer(Enum):
-    """What `exceeds` answers: compare it, as in ``is Answer.NO``.
+    """The answer of `exceeds`: compare the answer, as in ``is Answer.NO``.
 
-    It is neither true nor false, so that no `if` takes CANNOT_TELL for one of the others.
+    An answer in a bare `if` raises TypeError, so that CANNOT_TELL is never taken for YES or NO.
     """
 
     YES = "yes"
@@ -60,7 +60,7 @@ class Answer(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """One pressed area. It keeps its `id` for as long as it is followed from frame to frame."""
+    """One pressed area. A contact keeps its `id` while it is tracked from frame to frame."""
 
     #: The contact's identity, kept while the contact moves less than 25 mm from frame to frame and
     #: through gaps of up to 5 frames. Where two contacts merge, the contact nearer to the middle of
@@ -116,11 +116,11 @@ class Contact:
     frame: str | None = None  #: Name of the robot's link that carries the sheet
 
     def exceeds(self, limit_kpa: float) -> Answer:
-        """Return whether it presses with `limit_kpa` or more.
+        """Return whether the contact presses with `limit_kpa` or more.
 
-        YES goes by the best estimate of its highest pressure (the lower bound of 95 % of one that
-        is ``above``), NO by the upper bound of 95 %. So noise moves the answer near the limit to
-        and fro: stop at one, go on below a lower one.
+        YES goes by the best estimate of the highest pressure (the lower bound, 95 %, where the
+        contact is ``above``), NO by the upper bound (95 %). Noise changes the answer near the
+        limit: stop at one limit, and continue below a lower limit.
         """
         least_kpa = self.pressure_kpa if self.peak_kpa is None else self.peak_kpa
         if least_kpa is not None and least_kpa >= limit_kpa:
@@ -251,9 +251,9 @@ class Frame(Contacts):
 
     @property
     def age_s(self) -> float:
-        """Seconds since the scan was acquired, what buffers held it up by included.
+        """Seconds since the scan was acquired, delays in buffers included.
 
-        Of a recorded frame: until it was published; it grows no older.
+        A recorded frame has its age at publication.
         """
         since_receipt_ns = 0
         if self._received_ns is not None:
@@ -267,7 +267,7 @@ class Frame(Contacts):
 
     @property
     def is_known(self) -> bool:
-        """Whether every touch would be among `contacts`: if there is none, nothing presses.
+        """Whether every touch is among `contacts`: an empty list means that nothing presses.
 
         False where the frame is stale, or a flag says that touches may be missing.
         """
@@ -276,7 +276,7 @@ class Frame(Contacts):
     def exceeds(self, limit_kpa: float) -> Answer:
         """Return whether any contact presses with `limit_kpa` or more.
 
-        YES if one does. NO only if none does, the frame is fresh and nothing flags it.
+        YES if a contact does. NO only if no contact does and the frame is fresh and without flags.
         """
         answers = [contact.exceeds(limit_kpa) for contact in self.contacts]
         if Answer.YES in answers:
@@ -747,10 +747,10 @@ class Process:
 
 @dataclass(frozen=True, slots=True)
 class Status(Received):
-    """How a daemon is; one comes every second, whether or not data do.
+    """State of a daemon, received every second with or without data.
 
-    A stale one: the daemon is gone, hangs, or cannot be reached. What a daemon sends beyond these
-    names is in `fields`.
+    A stale status means that the daemon is gone, hangs, or cannot be reached. `fields` holds
+    everything that a daemon of another version sends beyond these names.
 
     Example::
 
