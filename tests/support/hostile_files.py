@@ -22,7 +22,7 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 from tactomo.recordings.recording import Origin
 from tactomo.recordings.recording_writer import RecordingWriter, port_entry
-from tactomo_protocol import Channel, Hello, SampleFormat, encode
+from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag, encode
 
 MEGABYTE: Final = 1 << 20
 ESCAPES: Final = "\x1b]0;owned\x07\x1b[2J[/b][red][link=file:///etc/passwd]a[/]\u202e\x9b31m"
@@ -125,6 +125,18 @@ def markup_recording(path: Path) -> None:
     """A device and a sensor whose names are markup."""
     origin = Origin(BAD_SENSOR, "paper_square", "", (ESCAPES,), ESCAPES)
     _recording(path, origin, [_hello(BAD_DEVICE), _hello("skin[left]")])
+
+
+def timeless_recording(path: Path) -> None:
+    """Scans of a computer whose clock stands still."""
+    writer = RecordingWriter(path, Origin("skin", "paper_square", "", ("a",), "0"))
+    at_ns, hello = 10_000_000_000, _hello("device")
+    writer.add(port_entry(0, encode(hello), at_ns, at_ns))
+    for counter in (1, 2, 3):
+        for channel in hello.channels:
+            scan = Scan(channel, counter, 50_000 * counter, ScanFlag(0), np.ones(208, np.float32))
+            writer.add(port_entry(0, encode(scan), at_ns, at_ns))
+    writer.close()
 
 
 def many_devices(path: Path) -> None:
@@ -284,6 +296,7 @@ CORPUS: Final[dict[str, Callable[[Path], None]]] = {
     "headless.csv": headless_csv,
     "markup.mcap": markup_recording,
     "devices.mcap": many_devices,
+    "timeless.mcap": timeless_recording,
     "password.mcap": password_recording,
     "piped.mcap": piped_recording,
     "records.mcap": tiny_records,

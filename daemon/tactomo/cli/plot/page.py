@@ -350,7 +350,8 @@ def _draw_timing(axes: Any, course: Course, _: dict[str, Any]) -> None:
     lost_at = [t for t, lost in zip(course.times_s, course.lost, strict=True) if lost]
     for time_s in lost_at:
         axes.axvline(time_s, color="tab:red", linewidth=0.8, alpha=0.6)
-    rate_hz = 1e3 / float(np.mean(periods_ms)) if len(periods_ms) else math.nan
+    whole_ms = float(periods_ms.sum())  # a clock may stand still, or have been set back
+    rate_hz = 1e3 * len(periods_ms) / whole_ms if whole_ms > 0 else math.nan
     ages = "age unknown: made of the recording"
     if known_ms:
         ages = f"age {np.median(known_ms):.1f} ms (99 %: {np.percentile(known_ms, 99):.1f})"
