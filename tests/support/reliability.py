@@ -28,7 +28,7 @@ These promises hold:
 - No frame contains damaged bytes; each intact scan is published, or counted as dropped.
 - Memory, threads and descriptors stay constant over a million scans and many subscribers.
 - Hostile boards, files and web pages never end the daemon.
-- A frozen converter, a second skin on one daemon and a tare under a press are reported.
+- A frozen converter or drive, a second skin on one daemon and a tare under a press are reported.
 
 These limits remain:
 
@@ -38,6 +38,8 @@ These limits remain:
 - At the very first tare, a frozen converter or an object on the skin looks like a skin at rest
   ([what to do](your_own_sensor.md)).
 - A wide press that begins lightly may be missing in its first frames.
+- Scans that one board delays by half a second behind an honest counter can make a sliding press
+  look like drift: its pressure is then told too low, without a flag.
 
 Machine: {machine}.
 
