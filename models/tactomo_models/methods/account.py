@@ -72,6 +72,11 @@ class Account:
         return self.family.split(self.fitted.parameters)
 
     @cached_property
+    def is_hardly_pressed(self) -> BoolArray:
+        """Which contacts (K,) the graded sheet does not tell to press."""
+        return hardly_pressed(self.family, self.fitted.parameters, self.jacobian)
+
+    @cached_property
     def sigmas(self) -> FloatArray:
         """(K, COLUMNS) their standard uncertainties; 0 of what is not fitted."""
         sigmas = np.zeros(self.family.free.shape)
@@ -82,43 +87,58 @@ class Account:
 
 def account_of(fit: FieldFit, fitted: FittedField, frame: Frame) -> Account:
     """The account that a fitted field is of a frame."""
-    likelihood = frame.likelihood
+    likelihood, family = frame.likelihood, fitted.family
+    assert isinstance(family, PressureField)
     jacobian = fit.jacobian(fitted, frame.measured)
     chi_squared = likelihood.chi_squared(fitted.residual)
     precision, offset = fit.prior(fitted)
-    told = without_light_peaks(fitted, jacobian)
-    hessian = likelihood.information(told, chi_squared)
-    hessian[np.diag_indices(len(hessian))] += precision
-    log_evidence = likelihood.log(chi_squared) - float(precision @ offset**2) / 2
-    log_evidence += log_occam(precision, hessian)
-    assert isinstance(fitted.family, PressureField)
-    log_evidence += log_prior(fitted.family.split(fitted.parameters))
+    log_evidence, hessian = laplace(
+        likelihood, family, fitted.parameters, jacobian, chi_squared, precision, offset
+    )
     valid = int(np.count_nonzero(likelihood.deflation))
     unit = likelihood.precision(chi_squared) * likelihood.count / max(valid, 1)
     return Account(fitted, jacobian, hessian, chi_squared, log_evidence, unit)
 
 
-def without_light_peaks(fitted: FittedField, jacobian: FloatArray) -> FloatArray:
+def laplace(
+    likelihood: Likelihood,
+    family: PressureField,
+    parameters: FloatArray,  # (N,)
+    jacobian: FloatArray,  # (sum M, N + 1) of the weighted residual
+    chi_squared: float,  # what is left of the data
+    precision: FloatArray,  # (N + 1,) inverse variances of what is likely
+    offset: FloatArray,  # (N + 1,) from what is likely
+) -> tuple[float, FloatArray]:
+    """Logarithm of a field's evidence, and the Hessian (N + 1, N + 1); see `evidence`."""
+    told = without_light_peaks(family, parameters, jacobian)
+    hessian = likelihood.information(told, chi_squared)
+    hessian[np.diag_indices(len(hessian))] += precision
+    log_evidence = likelihood.log(chi_squared) - float(precision @ offset**2) / 2
+    log_evidence += log_occam(precision, hessian) + log_prior(family.split(parameters))
+    return log_evidence, hessian
+
+
+def without_light_peaks(
+    family: PressureField, parameters: FloatArray, jacobian: FloatArray
+) -> FloatArray:
     """The derivative (sum M, N + 1) where light contacts' pressures leave no trace.
 
     Below its onset a graded sheet answers to nothing: any pressure down there is as likely as it
     was before. Laplace's method does not see that from a peak at the onset.
     """
-    family = fitted.family
-    assert isinstance(family, PressureField)
-    light = family.index[hardly_pressed(fitted, jacobian), PEAK]
+    light = family.index[hardly_pressed(family, parameters, jacobian), PEAK]
     if len(light):
         jacobian = jacobian.copy()
         jacobian[:, light] = 0.0
     return jacobian
 
 
-def hardly_pressed(fitted: FittedField, jacobian: FloatArray) -> BoolArray:
+def hardly_pressed(
+    family: PressureField, parameters: FloatArray, jacobian: FloatArray
+) -> BoolArray:
     """Which contacts (K,) press no harder than the graded sheet's onset, as far as data tell."""
-    family = fitted.family
-    assert isinstance(family, PressureField)
     hardly = family.free[:, PEAK].copy()
-    above = family.split(fitted.parameters)[hardly, PEAK] - family.onset
+    above = family.split(parameters)[hardly, PEAK] - family.onset
     power = (jacobian[:, family.index[hardly, PEAK]] ** 2).sum(axis=0)
     hardly[hardly] = above * np.sqrt(power) < CLEARLY
     return np.asarray(hardly)

@@ -13,7 +13,7 @@ import numpy as np
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.methods.kinds import SHARES, Kind, as_kind, kind_of
-from tactomo_models.methods.trial import Trial
+from tactomo_models.methods.foreseen import Foreseen
 from tactomo_models.scene.field_account import Alternative
 from tactomo_models.scene.parameters import COLUMNS
 
@@ -70,13 +70,11 @@ def to_be_asked(kind: Kind, rivals: Rivals) -> bool:
     return kind not in rivals or rivals[kind].is_open
 
 
-def rival_of(trial: Trial | None, contact: FloatArray, before: Rival | None) -> Rival:
-    """What a trial makes of a rival; of one that was asked before, the mean of both.
+def rival_of(trial: Foreseen, contact: FloatArray, before: Rival | None) -> Rival:
+    """What is foreseen of a rival; of one that was asked before, the mean of both.
 
     A mean and no sum: where a contact stays, errors of the sheet repeat themselves.
     """
-    if trial is None:
-        return Rival(-np.inf, np.zeros((0, COLUMNS)), np.zeros((0, COLUMNS)))
     odds = trial.log_odds if before is None else (trial.log_odds + before.log_odds) / 2
     if len(trial.contacts) != 1:
         return Rival(odds, trial.contacts, trial.sigmas)

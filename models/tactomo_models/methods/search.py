@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import BoolArray, FloatArray
-from tactomo_models.methods.account import Account, Frame, account_of, descended, hardly_pressed
+from tactomo_models.methods.account import Account, Frame, account_of, descended
 from tactomo_models.methods.contact_search import ContactSearch
 from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
 from tactomo_models.methods.rivals import (
@@ -32,7 +32,8 @@ from tactomo_models.methods.rivals import (
     turned,
     unasked,
 )
-from tactomo_models.methods.trial import FAR_STEPS, HOPELESS, Rest, gaps_between
+from tactomo_models.methods.foreseen import Foreseen, at_end, foreseen
+from tactomo_models.methods.trial import FAR_STEPS, HOPELESS, gaps_between
 from tactomo_models.scans.stillness import Since, are_still
 from tactomo_models.scene.field_account import Alternative
 from tactomo_models.scene.field_fit import COLD_S, FieldFit, Measured
@@ -432,15 +433,22 @@ class Search:
     def _asked(self, belief: Belief, k: int, kinds: list[Kind], frame: Frame) -> Belief:
         """Ask a contact whether it is of other kinds."""
         account = belief.account
-        rest = Rest(self.fit, self.field, account, [k], frame)
         mine = dict(belief.rivals[k])
         for kind in kinds:
-            trial = rest.trial(as_kind(account.contacts[k], kind))
-            mine[kind] = rival_of(trial, account.contacts[k], mine.get(kind))
-            if frame.budget.over:
-                break
+            found = foreseen(self.fit, self.field, account, k, kind, frame)
+            if found.log_odds > HOPELESS:
+                found = self._checked(account, k, found, frame)
+            mine[kind] = rival_of(found, account.contacts[k], mine.get(kind))
         rivals = (*belief.rivals[:k], mine, *belief.rivals[k + 1 :])
         return replace(belief, rivals=rivals)
+
+    def _checked(self, account: Account, k: int, found: Foreseen, frame: Frame) -> Foreseen:
+        """What was foreseen, by a solve where it ends."""
+        contacts = account.contacts
+        each = np.vstack([contacts[:k], found.contacts, contacts[k + 1 :]])
+        solved = self._account(each, account.fitted.log_ratio, frame)
+        own = np.arange(k, k + len(found.contacts))
+        return at_end(self.fit, solved, frame, own, account.log_evidence)
 
     def _decided(self, belief: Belief, asked: Pass, frame: Frame) -> Belief | None:
         """The belief with each contact of its likeliest kind, where that is likelier altogether."""
@@ -591,8 +599,7 @@ class Search:
 
 def _is_light(account: Account) -> bool:
     """Whether contacts are there, none of which the graded sheet tells to press."""
-    fitted = account.fitted
-    return account.family.count > 0 and bool(hardly_pressed(fitted, account.jacobian).all())
+    return account.family.count > 0 and bool(account.is_hardly_pressed.all())
 
 
 def _touching(contacts: FloatArray, near_m: float) -> Iterator[list[int]]:

@@ -1,0 +1,167 @@
+"""What a field of other contacts would come to, foreseen from the Jacobian without a solve.
+
+Voltages go by the conductivity of nodes. From the field as it was solved, other contacts are a step
+of conductivities; the residual there and its derivative follow to first order, and one step of
+Newton, within the limits of the parameters, leads to the end that a fit would come to:
+
+    r(p) = r_0 + J_nodes s(p)      s: see `FieldFit.step_to`
+
+The evidence of that end is compared with the evidence of the field. Of a field that is solved the
+same step says what is left to gain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.methods.account import Account, Frame, laplace
+from tactomo_models.methods.kinds import Kind, as_kind
+from tactomo_models.scene.drawing import Drawing
+from tactomo_models.scene.field_fit import FieldFit
+from tactomo_models.scene.parameters import PEAK
+from tactomo_models.scene.pressure_field import PressureField
+from tactomo_models.scene.sheet_response import GradedResponse
+
+BELOW = 1 - 1e-9  # of the onset: a peak there leaves no trace, and the table has no slope
+PEAKS = 64  # between the onset and the largest peak, that are compared with a contact's change
+MAX_LIMITED = 4  # times that parameters are held at their limits, before what is left is taken
+
+
+@dataclass(frozen=True)
+class Foreseen:
+    """The end of a fit."""
+
+    log_odds: float  # logarithm of its evidence over that of the field that it is foreseen from
+    contacts: FloatArray  # (m, COLUMNS) of the contacts that were asked about
+    sigmas: FloatArray  # (m, COLUMNS) their standard uncertainties; 0 of what is not fitted
+
+
+def foreseen(
+    fit: FieldFit, field: PressureField, account: Account, k: int, kind: Kind, frame: Frame
+) -> Foreseen:
+    """What a fit would come to with one contact of another kind.
+
+    Args:
+        fit: what fits fields to the sheets.
+        field: a field without contacts.
+        account: the field, at its minimum.
+        k: the contact.
+        kind: what it is instead.
+        frame: the data.
+    """
+    light = bool(account.is_hardly_pressed[k])
+    contacts = start_of(fit, field, account.contacts[k], kind, is_light=light)
+    old, own = account.family, np.arange(k, k + len(contacts))
+    each = np.vstack([account.contacts[:k], contacts, account.contacts[k + 1 :]])
+    family = field.of(each, fits_peaks=frame.fits_peaks)
+    is_own = np.isin(np.arange(family.count), own)
+    alone = replace(family, free=family.free & is_own[:, None])
+    step, by_own, by_ratio = fit.step_to(account.fitted, alone.draw(alone.join(each)), frame.measured)
+    jacobian = np.empty((len(step), len(family.join(each)) + 1))
+    kept = np.delete(old.index, k, axis=0)
+    jacobian[:, family.index[~is_own][family.free[~is_own]]] = account.jacobian[:, kept[kept >= 0]]
+    jacobian[:, family.index[own][family.free[own]]] = by_own
+    jacobian[:, -1] = account.jacobian[:, -1] + by_ratio
+    below = is_own & light
+    residual, log_ratio = account.fitted.residual + step, account.fitted.log_ratio
+    at = _At(family, family.bounded(family.join(each)), log_ratio, residual, jacobian, is_own & light)
+    return _end(fit, at, frame, account.log_evidence, own)
+
+
+def at_end(fit: FieldFit, account: Account, frame: Frame, own: IntArray, log_evidence: float) -> Foreseen:
+    """What a fit of some contacts comes to where it goes on, over a field of some evidence."""
+    fitted = account.fitted
+    is_below = np.isin(np.arange(account.family.count), own) & account.is_hardly_pressed
+    at = _At(
+        account.family,
+        fitted.parameters,
+        fitted.log_ratio,
+        fitted.residual,
+        account.jacobian,
+        is_below,
+    )
+    return _end(fit, at, frame, log_evidence, own)
+
+
+def start_of(
+    fit: FieldFit, field: PressureField, contact: FloatArray, kind: Kind, *, is_light: bool
+) -> FloatArray:
+    """What presses (m, COLUMNS) where a contact is of a kind and changes the graded sheet as much.
+
+    What presses too lightly for the graded sheet presses no harder than its onset.
+    """
+    contacts = as_kind(contact, kind)
+    if is_light:
+        contacts[:, PEAK] = np.minimum(contacts[:, PEAK], BELOW * field.onset)
+        return contacts
+    graded = next((r for r in fit.responses.values() if isinstance(r, GradedResponse)), None)
+    if graded is None or not len(contacts):
+        return contacts
+    before, after = (_drawn(field, some) for some in (contact[None], contacts))
+    asked = before.share @ graded.relative_change(before.pressure_kpa)[0]
+    most = float(contacts[:, PEAK].max())
+    peaks = np.linspace(field.onset, field.peak_limits[1], PEAKS)
+    pressure = peaks[:, None] / most * after.pressure_kpa
+    changes = graded.relative_change(pressure)[0] @ after.share
+    contacts[:, PEAK] *= np.interp(abs(asked), np.abs(changes), peaks) / most
+    return contacts
+
+
+def _drawn(field: PressureField, contacts: FloatArray) -> Drawing:
+    family = field.of(contacts)
+    return family.draw(family.join(contacts))
+
+
+@dataclass(frozen=True)
+class _At:
+    """A field on the way to its minimum."""
+
+    family: PressureField
+    parameters: FloatArray  # (N,)
+    log_ratio: float
+    residual: FloatArray  # (sum M,) weighted
+    jacobian: FloatArray  # (sum M, N + 1) its derivative
+    is_below: BoolArray  # (K,) contacts whose peaks stay below the graded sheet's onset
+
+
+def _end(fit: FieldFit, at: _At, frame: Frame, log_evidence: float, own: IntArray) -> Foreseen:
+    family, likelihood, J = at.family, frame.likelihood, at.jacobian
+    precision, offset = fit.prior_of(family, at.parameters, at.log_ratio)
+    normal = J.T @ J
+    normal[np.diag_indices(len(normal))] += precision
+    step = _newton(fit, at, normal, J.T @ at.residual + precision * offset)
+    parameters = at.parameters + step[:-1]
+    chi_squared = likelihood.chi_squared(at.residual + J @ step)
+    found, hessian = laplace(
+        likelihood, family, parameters, J, chi_squared, precision, offset + step
+    )
+    sigmas = np.zeros(family.free.shape)
+    sigmas[family.free] = np.sqrt(np.diag(np.linalg.inv(hessian))[:-1])
+    return Foreseen(found - log_evidence, family.split(parameters)[own], sigmas[own])
+
+
+def _newton(fit: FieldFit, at: _At, normal: FloatArray, gradient: FloatArray) -> FloatArray:
+    """The step (N + 1,) to the minimum, as far as the limits of parameters and log ratio let it."""
+    step, held = np.zeros(len(gradient)), np.zeros(len(gradient), bool)
+    for _ in range(MAX_LIMITED):
+        free = ~held
+        pull = gradient[free] + normal[np.ix_(free, held)] @ step[held]
+        step[free] = -np.linalg.solve(normal[np.ix_(free, free)], pull)
+        limited = _limited(fit, at, step)
+        beyond = free & (np.abs(limited - step) > 1e-12)
+        step, held = limited, held | beyond
+        if not beyond.any() or held.all():
+            break
+    return step
+
+
+def _limited(fit: FieldFit, at: _At, step: FloatArray) -> FloatArray:
+    """A step (N + 1,), cut where a parameter or the log ratio has its limit."""
+    family = at.family
+    each = family.split(family.bounded(at.parameters + step[:-1]))
+    each[at.is_below, PEAK] = np.minimum(each[at.is_below, PEAK], BELOW * family.onset)
+    ratio = fit.bounded_ratio(at.log_ratio + float(step[-1]))
+    return np.append(family.join(each) - at.parameters, ratio - at.log_ratio)
