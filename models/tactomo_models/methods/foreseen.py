@@ -34,7 +34,7 @@ MAX_LIMITED = 4  # times that parameters are held at their limits, before what i
 class Foreseen:
     """The end of a fit."""
 
-    log_odds: float  # logarithm of its evidence over that of the field that it is foreseen from
+    log_evidence: float
     contacts: FloatArray  # (m, COLUMNS) of the contacts that were asked about
     sigmas: FloatArray  # (m, COLUMNS) their standard uncertainties; 0 of what is not fitted
 
@@ -68,12 +68,13 @@ def foreseen(
     below = is_own & light
     residual, log_ratio = account.fitted.residual + step, account.fitted.log_ratio
     at = _At(family, family.bounded(family.join(each)), log_ratio, residual, jacobian, is_own & light)
-    return _end(fit, at, frame, account.log_evidence, own)
+    return _end(fit, at, frame, own)
 
 
-def at_end(fit: FieldFit, account: Account, frame: Frame, own: IntArray, log_evidence: float) -> Foreseen:
-    """What a fit of some contacts comes to where it goes on, over a field of some evidence."""
+def at_end(fit: FieldFit, account: Account, frame: Frame, own: IntArray | None = None) -> Foreseen:
+    """What a fit comes to where it goes on, and some of its contacts; all if None."""
     fitted = account.fitted
+    own = np.arange(account.family.count) if own is None else own
     is_below = np.isin(np.arange(account.family.count), own) & account.is_hardly_pressed
     at = _At(
         account.family,
@@ -83,7 +84,7 @@ def at_end(fit: FieldFit, account: Account, frame: Frame, own: IntArray, log_evi
         account.jacobian,
         is_below,
     )
-    return _end(fit, at, frame, log_evidence, own)
+    return _end(fit, at, frame, own)
 
 
 def start_of(
@@ -127,7 +128,7 @@ class _At:
     is_below: BoolArray  # (K,) contacts whose peaks stay below the graded sheet's onset
 
 
-def _end(fit: FieldFit, at: _At, frame: Frame, log_evidence: float, own: IntArray) -> Foreseen:
+def _end(fit: FieldFit, at: _At, frame: Frame, own: IntArray) -> Foreseen:
     family, likelihood, J = at.family, frame.likelihood, at.jacobian
     precision, offset = fit.prior_of(family, at.parameters, at.log_ratio)
     normal = J.T @ J
@@ -140,7 +141,7 @@ def _end(fit: FieldFit, at: _At, frame: Frame, log_evidence: float, own: IntArra
     )
     sigmas = np.zeros(family.free.shape)
     sigmas[family.free] = np.sqrt(np.diag(np.linalg.inv(hessian))[:-1])
-    return Foreseen(found - log_evidence, family.split(parameters)[own], sigmas[own])
+    return Foreseen(found, family.split(parameters)[own], sigmas[own])
 
 
 def _newton(fit: FieldFit, at: _At, normal: FloatArray, gradient: FloatArray) -> FloatArray:

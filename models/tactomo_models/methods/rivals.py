@@ -70,15 +70,18 @@ def to_be_asked(kind: Kind, rivals: Rivals) -> bool:
     return kind not in rivals or rivals[kind].is_open
 
 
-def rival_of(trial: Foreseen, contact: FloatArray, before: Rival | None) -> Rival:
+def rival_of(
+    found: Foreseen, log_odds: float, contact: FloatArray, before: Rival | None
+) -> Rival:
     """What is foreseen of a rival; of one that was asked before, the mean of both.
 
     A mean and no sum: where a contact stays, errors of the sheet repeat themselves.
     """
-    odds = trial.log_odds if before is None else (trial.log_odds + before.log_odds) / 2
-    if len(trial.contacts) != 1:
-        return Rival(odds, trial.contacts, trial.sigmas)
-    return Rival(odds, trial.contacts[0] - contact, trial.sigmas[0])
+    if before is not None:
+        log_odds = (log_odds + before.log_odds) / 2
+    if len(found.contacts) != 1:
+        return Rival(log_odds, found.contacts, found.sigmas)
+    return Rival(log_odds, found.contacts[0] - contact, found.sigmas[0])
 
 
 def turned(rivals: Rivals, kind: Kind, own: Kind, sigmas: FloatArray) -> Rivals:

@@ -433,12 +433,13 @@ class Search:
     def _asked(self, belief: Belief, k: int, kinds: list[Kind], frame: Frame) -> Belief:
         """Ask a contact whether it is of other kinds."""
         account = belief.account
-        mine = dict(belief.rivals[k])
+        mine, now = dict(belief.rivals[k]), at_end(self.fit, account, frame)
         for kind in kinds:
             found = foreseen(self.fit, self.field, account, k, kind, frame)
-            if found.log_odds > HOPELESS:
+            if found.log_evidence - now.log_evidence > HOPELESS:
                 found = self._checked(account, k, found, frame)
-            mine[kind] = rival_of(found, account.contacts[k], mine.get(kind))
+            log_odds = found.log_evidence - now.log_evidence
+            mine[kind] = rival_of(found, log_odds, account.contacts[k], mine.get(kind))
         rivals = (*belief.rivals[:k], mine, *belief.rivals[k + 1 :])
         return replace(belief, rivals=rivals)
 
@@ -448,7 +449,7 @@ class Search:
         each = np.vstack([contacts[:k], found.contacts, contacts[k + 1 :]])
         solved = self._account(each, account.fitted.log_ratio, frame)
         own = np.arange(k, k + len(found.contacts))
-        return at_end(self.fit, solved, frame, own, account.log_evidence)
+        return at_end(self.fit, solved, frame, own)
 
     def _decided(self, belief: Belief, asked: Pass, frame: Frame) -> Belief | None:
         """The belief with each contact of its likeliest kind, where that is likelier altogether."""
