@@ -35,8 +35,21 @@ class Foreseen:
     """The end of a fit."""
 
     log_evidence: float
-    contacts: FloatArray  # (m, COLUMNS) of the contacts that were asked about
-    sigmas: FloatArray  # (m, COLUMNS) their standard uncertainties; 0 of what is not fitted
+    every: FloatArray  # (K, COLUMNS) all contacts
+    log_ratio: float
+    gain: float  # what the last step takes off the cost
+    own: IntArray  # (m,) which were asked about
+    every_sigma: FloatArray  # (K, COLUMNS) standard uncertainties; 0 of what is not fitted
+
+    @property
+    def contacts(self) -> FloatArray:
+        """(m, COLUMNS) contacts that were asked about."""
+        return np.asarray(self.every[self.own])
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(m, COLUMNS) their standard uncertainties."""
+        return np.asarray(self.every_sigma[self.own])
 
 
 def foreseen(
@@ -133,7 +146,9 @@ def _end(fit: FieldFit, at: _At, frame: Frame, own: IntArray) -> Foreseen:
     precision, offset = fit.prior_of(family, at.parameters, at.log_ratio)
     normal = J.T @ J
     normal[np.diag_indices(len(normal))] += precision
-    step = _newton(fit, at, normal, J.T @ at.residual + precision * offset)
+    gradient = J.T @ at.residual + precision * offset
+    step = _newton(fit, at, normal, gradient)
+    gain = -float((2 * gradient + normal @ step) @ step)
     parameters = at.parameters + step[:-1]
     chi_squared = likelihood.chi_squared(at.residual + J @ step)
     found, hessian = laplace(
@@ -141,7 +156,8 @@ def _end(fit: FieldFit, at: _At, frame: Frame, own: IntArray) -> Foreseen:
     )
     sigmas = np.zeros(family.free.shape)
     sigmas[family.free] = np.sqrt(np.diag(np.linalg.inv(hessian))[:-1])
-    return Foreseen(found, family.split(parameters)[own], sigmas[own])
+    log_ratio = at.log_ratio + float(step[-1])
+    return Foreseen(found, family.split(parameters), log_ratio, gain, own, sigmas)
 
 
 def _newton(fit: FieldFit, at: _At, normal: FloatArray, gradient: FloatArray) -> FloatArray:

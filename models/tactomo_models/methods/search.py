@@ -24,6 +24,7 @@ from tactomo_models.methods.account import Account, Frame, account_of, descended
 from tactomo_models.methods.contact_search import ContactSearch
 from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
 from tactomo_models.methods.rivals import (
+    OPEN,
     Rivals,
     choices,
     opened,
@@ -51,6 +52,7 @@ LIKELIER = (
 # may be none. With every contact asked for both, cold frames take a third longer.
 LONG, KNOWN_SIZE = 0.1, 0.25
 FEW_STEPS = 4  # of starts that are compared: a start's cost says little before
+FORESEEN = 0.5
 STEPS = 4  # of a fit in one go, before what is left is looked at
 # Chi-squared over the count of data, from which a contact is missing rather than of another kind.
 SURPRISE = 2.0
@@ -437,19 +439,22 @@ class Search:
         for kind in kinds:
             found = foreseen(self.fit, self.field, account, k, kind, frame)
             if found.log_evidence - now.log_evidence > HOPELESS:
-                found = self._checked(account, k, found, frame)
+                found = self._checked(found, now.log_evidence + OPEN, frame)
             log_odds = found.log_evidence - now.log_evidence
             mine[kind] = rival_of(found, log_odds, account.contacts[k], mine.get(kind))
         rivals = (*belief.rivals[:k], mine, *belief.rivals[k + 1 :])
         return replace(belief, rivals=rivals)
 
-    def _checked(self, account: Account, k: int, found: Foreseen, frame: Frame) -> Foreseen:
-        """What was foreseen, by a solve where it ends."""
-        contacts = account.contacts
-        each = np.vstack([contacts[:k], found.contacts, contacts[k + 1 :]])
-        solved = self._account(each, account.fitted.log_ratio, frame)
-        own = np.arange(k, k + len(found.contacts))
-        return at_end(self.fit, solved, frame, own)
+    def _checked(self, found: Foreseen, least: float, frame: Frame) -> Foreseen:
+        """What was foreseen, by solves from where it ends, as long as it is open."""
+        solved = self._account(found.every, found.log_ratio, frame)
+        found = at_end(self.fit, solved, frame, found.own)
+        for _ in range(STEPS):
+            if found.gain * solved.unit < FORESEEN or found.log_evidence < least:
+                break
+            solved = self._descended(solved, frame, 1)
+            found = at_end(self.fit, solved, frame, found.own)
+        return found
 
     def _decided(self, belief: Belief, asked: Pass, frame: Frame) -> Belief | None:
         """The belief with each contact of its likeliest kind, where that is likelier altogether."""
