@@ -25,7 +25,7 @@ void use_blas(void *gemm, void *trsm, void *potrf, void *getrf, void *getrs) {
   dgemm = gemm, dtrsm = trsm, dpotrf = potrf, dgetrf = getrf, dgetrs = getrs;
 }
 
-enum { UNSOLVABLE = 1, TOUCHES = 2 }; /* what else a function may return */
+enum { UNSOLVABLE = 1 }; /* what else a function may return */
 
 /* C (m, n) = alpha op(A) op(B) + beta C, all columns. */
 static void multiply(char ta, char tb, int m, int n, int k, double alpha, const double *A, int lda,
@@ -62,26 +62,10 @@ typedef struct {
   const double *green_double;      /* function, in the precision that it has; else NULL */
 } Sheet;
 
-/* Other areas that stay as they are, and A: how they answer what all else makes there; the theory
- * stands in `forward`. S E - L goes area by area. */
-typedef struct {
-  int64_t rim, near, areas;
-  const int64_t *rim_node;  /* (rim,) positions in the support */
-  const int64_t *near_node; /* (near,) */
-  const uint8_t *inside;    /* (support,) whether a node belongs to them */
-  int64_t *rim_start;       /* (areas + 1,) */
-  int64_t *near_start;      /* (areas + 1,) */
-  double *law;              /* (near, rim) of each area: S E - L, transposed */
-  double *factors;          /* (rim, rim) of 1 + (S - S0) G, whose transpose has columns */
-  int *pivots;              /* (rim,) */
-  double *injected;         /* (rim, fields) columns, where nothing else is pressed */
-  const double *transfer;   /* (fields + 1, fields + 1) where nothing else is pressed */
-} Frozen;
-
 /* The areas around pressed nodes; (t,) triangles, (n,) nodes. */
 typedef struct {
   int64_t triangles, nodes, layers, rim, near;
-  int64_t is_known;  /* whether `both`, `bare` and `taken` are filled */
+  int64_t is_known;  /* whether `both` and `bare` are filled */
   int64_t *triangle; /* (t,) area by area */
   int64_t *corner;   /* (t, 3) places among the nodes */
   int64_t *node;     /* (n,) positions in the support, area by area, layer by layer inwards */
@@ -90,15 +74,12 @@ typedef struct {
   int64_t *layer;    /* (n,) */
   double *both;      /* (rim, rim + fields), G and u0 side by side */
   double *bare;      /* (rim, rim + fields): what the bare areas' stiffness makes of both */
-  double *taken;     /* (frozen rim, rim) columns: A G, frozen areas' answer to currents there */
 } Areas;
 
 /* Find the areas around nodes (count,); buffers of `areas` are large enough for any. Returns
- * UNSOLVABLE where an area has no rim (on no sheet is there one), TOUCHES where one touches those
- * that are `frozen` (which may be NULL). */
-int find_areas(const Sheet *s, const Frozen *frozen, int64_t count, const int64_t *where,
-               Areas *a) {
-  int64_t S = s->support, T = s->triangles, n = 0, touches = 0;
+ * UNSOLVABLE where an area has no rim (on no sheet is there one). */
+int find_areas(const Sheet *s, int64_t count, const int64_t *where, Areas *a) {
+  int64_t S = s->support, T = s->triangles, n = 0;
   int64_t *place = malloc(sizeof(int64_t) * (5 * S + 2));
   uint8_t *hit = calloc(T + 1 + S, 1);
   if (!place || !hit) {
@@ -123,7 +104,6 @@ int find_areas(const Sheet *s, const Frozen *frozen, int64_t count, const int64_
   for (int64_t i = 0; i < S; i++) {
     if (!there[i]) continue;
     depth[i] = part[i] = -1, n++;
-    touches |= frozen && frozen->inside[i];
     if (!s->closed[i] || here[i] < s->triangle_count[i]) depth[i] = 0, queue[tail++] = i;
   }
   for (; head < tail; head++)
@@ -170,7 +150,7 @@ int find_areas(const Sheet *s, const Frozen *frozen, int64_t count, const int64_
     for (int c = 0; c < 3; c++) a->corner[3 * i + c] = place[s->corner_support[3 * t + c]];
   }
   free(place), free(hit);
-  return done != n ? UNSOLVABLE : touches ? TOUCHES : 0;
+  return done != n ? UNSOLVABLE : 0;
 }
 
 /* Rows (rim, most_near) of the bare areas' stiffness: columns among the near nodes, values. */
@@ -230,14 +210,8 @@ static double green_at(const Sheet *s, int64_t row, int64_t column) {
   return s->green_single ? s->green_single[place] : s->green_double[place];
 }
 
-/* Green's function between nodes (rows,) and (columns,), into rows that are `width` apart. */
-static void look_up(const Sheet *s, int64_t rows, const int64_t *row, int64_t columns,
-                    const int64_t *column, double *green, int64_t width) {
-  for (int64_t i = 0; i < rows; i++)
-    for (int64_t j = 0; j < columns; j++) green[i * width + j] = green_at(s, row[i], column[j]);
-}
-
-/* The same between near nodes and rims: what is symmetric is looked up once, along its rows. */
+/* Green's function between near nodes and rims, into rows that are `width` apart: what is symmetric
+ * is looked up once, along its rows. */
 static void look_up_own(const Sheet *s, const Areas *a, const Law *l, double *green,
                         int64_t width) {
   for (int64_t i = 0; i < a->nodes; i++) {
@@ -253,64 +227,27 @@ static void look_up_own(const Sheet *s, const Areas *a, const Law *l, double *gr
         green[l->rim_column[i] * width + j] = green[l->rim_column[j] * width + i];
 }
 
-/* Blocks of the Green's function that Python gives where the sheet has it in pieces. */
-typedef struct {
-  const double *own;     /* (near, rim) */
-  const double *outward; /* (near, frozen rim) */
-  const double *inward;  /* (frozen near, rim) */
-} Green;
-
-static void block(const Sheet *s, const double *given, int64_t rows, const int64_t *row,
-                  int64_t columns, const int64_t *column, double *green, int64_t width) {
-  if (!given) look_up(s, rows, row, columns, column, green, width);
-  for (int64_t i = 0; i < rows && given; i++)
-    memcpy(green + i * width, given + i * columns, sizeof(double) * columns);
-}
-
-/* A u (rim, width), columns, of potentials u (near, width) in frozen areas. */
-static void answer(const Frozen *f, int width, const double *near, double *currents) {
-  int rim = f->rim, failed;
-  const double *law = f->law;
-  for (int64_t i = 0; i < f->areas; i++) {
-    int rows = f->rim_start[i + 1] - f->rim_start[i];
-    int columns = f->near_start[i + 1] - f->near_start[i];
-    multiply('N', 'T', rows, width, columns, 1.0, law, rows, near + f->near_start[i] * width, width,
-             0.0, currents + f->rim_start[i], rim);
-    law += rows * columns;
-  }
-  if (rim) dgetrs("T", &rim, &width, f->factors, &rim, f->pivots, currents, &rim, &failed);
-}
-
 /* Fill in what areas know of the bare sheet: G and u0 at their rims, and the law on them.
  *
- * Beside frozen areas these take the bare sheet's place: G - G_ko A G_ok, u0 + G_ko i. Either is
- * balanced at inner nodes, so that the bare law, at rims and by their neighbours, does what the
- * bare areas' condensed stiffness does.
+ * given: (near, rim) of the Green's function, where the sheet has it in pieces; else NULL.
+ * Either is balanced at inner nodes, so that the bare law, at rims and by their neighbours, does what
+ * the bare areas' condensed stiffness does.
  */
-static int know(const Sheet *s, const Frozen *f, const Green *given, Areas *a) {
-  int64_t r = a->rim, F = s->fields, width = r + F, others = f ? f->rim : 0, more = f ? f->near : 0;
-  double *near = malloc(sizeof(double) * (a->near * (width + others) + more * r + 1));
+static int know(const Sheet *s, const double *given, Areas *a) {
+  int64_t r = a->rim, F = s->fields, width = r + F;
+  double *near = malloc(sizeof(double) * (a->near * width + 1));
   Law l;
   if (!near || find_law(s, a, &l)) {
     free(near);
     return -1;
   }
-  double *outward = near + a->near * width, *inward = outward + a->near * others;
-  if (given->own)
-    block(s, given->own, a->near, l.near_node, r, l.rim_node, near, width);
+  if (given)
+    for (int64_t i = 0; i < a->near; i++)
+      memcpy(near + i * width, given + i * r, sizeof(double) * r);
   else
     look_up_own(s, a, &l, near, width);
   for (int64_t i = 0; i < a->near; i++)
     memcpy(near + i * width + r, s->potentials + l.near_node[i] * F, sizeof(double) * F);
-  if (f) {
-    block(s, given->outward, a->near, l.near_node, others, f->rim_node, outward, others);
-    block(s, given->inward, more, f->near_node, r, l.rim_node, inward, r);
-    answer(f, r, inward, a->taken);
-    multiply('T', 'N', r, a->near, others, -1.0, a->taken, others, outward, others, 1.0, near,
-             width);
-    multiply('T', 'N', F, a->near, others, 1.0, f->injected, others, outward, others, 1.0,
-             near + r, width);
-  }
   for (int64_t i = 0; i < a->nodes; i++) {
     int64_t row = l.row[i];
     if (row < 0) continue;
@@ -435,11 +372,11 @@ typedef struct {
   double *voltages;   /* (voltages,) */
   double *residual;   /* (voltages,) weighted */
   double *potentials; /* (nodes, fields) */
-  double *injected;   /* (rim, fields) columns; frozen rims after the areas' own */
+  double *injected;   /* (rim, fields) columns */
 } Pressing;
 
-/* Voltages of transfer resistances to which `moved` (fields, fields), columns, is added. */
-static void scan(const Sheet *s, const double *transfer, const double *moved, double *voltages) {
+/* Voltages of the bare transfer resistances with `moved` (fields, fields), columns, added. */
+static void scan(const Sheet *s, const double *moved, double *voltages) {
   int64_t F = s->fields;
   for (int64_t v = 0; v < s->voltages; v++) {
     const int64_t *e = s->electrodes + 4 * v;
@@ -447,7 +384,7 @@ static void scan(const Sheet *s, const double *transfer, const double *moved, do
     for (int d = 0; d < 2; d++) {
       double at[2];
       for (int m = 0; m < 2; m++) {
-        at[m] = transfer[e[2 + m] * (F + 1) + e[d]];
+        at[m] = s->transfer[e[2 + m] * (F + 1) + e[d]];
         if (e[2 + m] < F && e[d] < F) at[m] += moved[e[d] * F + e[2 + m]];
       }
       each[d] = at[0] - at[1];
@@ -458,7 +395,7 @@ static void scan(const Sheet *s, const double *transfer, const double *moved, do
 
 /* Potentials on the rims, u0 + G i, and from there inwards. */
 static void spread(const Sheet *s, const Areas *a, const Condensed *c, const double *injected,
-                   int lead, double *potentials) {
+                   double *potentials) {
   int F = s->fields, r = a->rim, width = r + F, first = 0;
   for (int64_t l = 0; l < a->layers; l++) {
     int size = size_of(a, l), outer = outer_of(a, l);
@@ -466,7 +403,7 @@ static void spread(const Sheet *s, const Areas *a, const Condensed *c, const dou
     if (!outer) {
       for (int64_t i = 0; i < size; i++)
         memcpy(of + i * F, a->both + (first + i) * width + r, sizeof(double) * F);
-      multiply('T', 'N', F, size, r, 1.0, injected, lead, a->both + first * width, width, 1.0, of,
+      multiply('T', 'N', F, size, r, 1.0, injected, r, a->both + first * width, width, 1.0, of,
                F);
       first += size;
     } else {
@@ -478,18 +415,17 @@ static void spread(const Sheet *s, const Areas *a, const Condensed *c, const dou
   }
 }
 
-/* Currents (rim, fields), columns that are `lead` apart, that rims inject. */
-static void inject(const Sheet *s, const Areas *a, const Condensed *c, int lead,
-                   double *injected) {
+/* Currents (rim, fields), columns, that rims inject. */
+static void inject(const Sheet *s, const Areas *a, const Condensed *c, double *injected) {
   int F = s->fields, r = a->rim, width = r + F, failed;
   for (int64_t i = 0; i < r; i++)
-    for (int64_t m = 0; m < F; m++) injected[m * lead + i] = -c->system[i * width + r + m];
-  if (r) dgetrs("T", &r, &F, c->system, &width, c->pivots, injected, &lead, &failed);
+    for (int64_t m = 0; m < F; m++) injected[m * r + i] = -c->system[i * width + r + m];
+  if (r) dgetrs("T", &r, &F, c->system, &width, c->pivots, injected, &r, &failed);
 }
 
 /* Solve for a pressed sheet; see `ForwardModel.solve`. */
-static int solve(const Sheet *s, const Areas *a, const Frozen *f, const Pressing *p) {
-  int F = s->fields, r = a->rim, width = r + F, lead = r + (f ? f->rim : 0), failed;
+static int solve(const Sheet *s, const Areas *a, const Pressing *p) {
+  int F = s->fields, r = a->rim, width = r + F, failed;
   double *moved = malloc(sizeof(double) * F * F);
   Condensed c;
   failed = moved ? condense(s, a, p->mixes_resistivities, p->change, &c) : -1;
@@ -497,17 +433,11 @@ static int solve(const Sheet *s, const Areas *a, const Frozen *f, const Pressing
     free(moved);
     return failed;
   }
-  inject(s, a, &c, lead, p->injected);
+  inject(s, a, &c, p->injected);
   /* u0^T i, by which the electrodes' potentials differ. */
-  multiply('N', 'N', F, F, r, 1.0, a->both + r, width, p->injected, lead, 0.0, moved, F);
-  scan(s, f ? f->transfer : s->transfer, moved, p->voltages);
-  spread(s, a, &c, p->injected, lead, p->potentials);
-  if (f) { /* what frozen areas inject, too: i - A G i */
-    for (int64_t m = 0; m < F; m++)
-      memcpy(p->injected + m * lead + r, f->injected + m * f->rim, sizeof(double) * f->rim);
-    multiply('N', 'N', f->rim, F, r, -1.0, a->taken, f->rim, p->injected, lead, 1.0,
-             p->injected + r, lead);
-  }
+  multiply('N', 'N', F, F, r, 1.0, a->both + r, width, p->injected, r, 0.0, moved, F);
+  scan(s, moved, p->voltages);
+  spread(s, a, &c, p->injected, p->potentials);
   free(moved), forget(&c);
   return 0;
 }
@@ -603,11 +533,11 @@ static int change_by(const Sheet *s, const Response *response, Pressing *p) {
  * `response` may be NULL: then the conductivities are given. `data` may be: then nothing is
  * compared. Returns UNSOLVABLE where a conductivity is not above 0.
  */
-int evaluate(const Sheet *s, Areas *a, const Frozen *f, const Green *green,
-             const Response *response, const Data *data, Pressing *p) {
-  int made = a->is_known ? 0 : know(s, f, green, a);
+int evaluate(const Sheet *s, Areas *a, const double *green, const Response *response,
+             const Data *data, Pressing *p) {
+  int made = a->is_known ? 0 : know(s, green, a);
   if (!made && response) made = change_by(s, response, p);
-  if (!made) made = solve(s, a, f, p);
+  if (!made) made = solve(s, a, p);
   if (made || !data) return made;
   double *of = malloc(sizeof(double) * (data->drifts + 1));
   if (!of) return -1;
@@ -618,53 +548,6 @@ int evaluate(const Sheet *s, Areas *a, const Frozen *f, const Green *green,
   undrift(s, data, 1, p->residual, of);
   free(of);
   return 0;
-}
-
-/* The rims' stiffness less the bare law, area by area: see `Frozen.law`. */
-static void freeze_law(const Sheet *s, const Areas *a, const Condensed *c, const Law *l,
-                       Frozen *f) {
-  double *law = f->law;
-  int64_t rim = 0, near = 0, area = 0;
-  for (int64_t layer = 0; layer < a->layers; layer++) {
-    if (outer_of(a, layer)) continue;
-    int64_t size = size_of(a, layer), first = a->start[layer], columns = size;
-    if (layer + 1 < a->layers && outer_of(a, layer + 1)) columns += size_of(a, layer + 1);
-    memset(law, 0, sizeof(double) * size * columns);
-    memcpy(law, c->flat + c->offset[layer], sizeof(double) * size * size);
-    for (int64_t i = 0; i < size; i++) {
-      int64_t row = l->row[first + i];
-      for (int64_t e = 0; e < l->entries[row]; e++) {
-        int64_t place = row * s->most_near + e;
-        law[(l->at[place] - near) * size + i] -= l->value[place];
-      }
-    }
-    f->rim_start[area] = rim, f->near_start[area++] = near;
-    rim += size, near += columns, law += size * columns;
-  }
-  f->rim_start[area] = rim, f->near_start[area] = near, f->areas = area;
-}
-
-/* Freeze areas in what is pressed: fill in how they answer; see `Frozen`. */
-int freeze(const Sheet *s, Areas *a, const Green *green, const Response *response, Pressing *p,
-           Frozen *f) {
-  int64_t r = a->rim, width = r + s->fields;
-  int made = a->is_known ? 0 : know(s, NULL, green, a);
-  if (!made) made = change_by(s, response, p);
-  Condensed c;
-  Law l;
-  if (made || (made = find_law(s, a, &l))) return made;
-  made = condense(s, a, p->mixes_resistivities, p->change, &c);
-  if (!made) {
-    freeze_law(s, a, &c, &l, f);
-    inject(s, a, &c, r, f->injected);
-    for (int64_t i = 0; i < r; i++) {
-      memcpy(f->factors + i * r, c.system + i * width, sizeof(double) * r);
-      f->pivots[i] = c.pivots[i];
-    }
-    forget(&c);
-  }
-  free(l.row), free(l.value);
-  return made;
 }
 
 enum { STRIP = 64 }; /* triangles at once: what that takes stays in the cache */

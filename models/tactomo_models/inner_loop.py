@@ -22,11 +22,10 @@ _ROUTINES = {
 }
 _COUNT, _ARRAY = ctypes.c_int64, ctypes.c_void_p
 _ARGUMENTS = {
-    "find_areas": [_ARRAY, _ARRAY, _COUNT, _ARRAY, _ARRAY],
-    "evaluate": [_ARRAY] * 7,
+    "find_areas": [_ARRAY, _COUNT, _ARRAY, _ARRAY],
+    "evaluate": [_ARRAY] * 6,
     "evaluate_slopes": [*[_ARRAY] * 5, _COUNT, *[_ARRAY] * 3],
     "differentiate": [_ARRAY, _ARRAY, _COUNT, *[_ARRAY] * 3, _COUNT, *[_ARRAY] * 3],
-    "freeze": [_ARRAY] * 6,
     "conduct": [_ARRAY, _COUNT, _ARRAY, _ARRAY, ctypes.c_double, _ARRAY, _ARRAY],
     "draw": [_ARRAY, _COUNT, _ARRAY, _COUNT, *[_ARRAY] * 7],
     "draw_slopes": [_ARRAY, _COUNT, _ARRAY, _COUNT, *[_ARRAY] * 3, _COUNT, *[_ARRAY] * 4],

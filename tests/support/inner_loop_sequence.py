@@ -1,4 +1,4 @@
-"""Evaluations, Jacobians and backgrounds in a row by a given library, for sanitizers.
+"""Evaluations, Jacobians and steps in a row by a given library, for sanitizers.
 
 python inner_loop_sequence.py LIBRARY
 """
@@ -20,7 +20,7 @@ from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import mesh_sheet
 from tactomo_models.scene.field_fit import FieldFit
 from tactomo_models.scene.level_set import LevelSet
-from tactomo_models.scene.parameters import HARMONIC, HOLE, SIZE, X, Y
+from tactomo_models.scene.parameters import HARMONIC, HOLE, PEAK, SIZE, X, Y
 from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import GradedResponse
 
@@ -42,7 +42,7 @@ def fit_of(kind: str, sensor: SensorDescription) -> FieldFit:
 
 
 def run(fit: FieldFit) -> None:
-    """Draw, evaluate, differentiate and freeze one scene after another."""
+    """Draw, evaluate and differentiate one scene after another, and step to fewer contacts."""
     rng, count = np.random.default_rng(1), len(fit.forward.bare_voltages)
     data = {
         name: measured(rng.normal(size=count), 2.0).drifting(rng.normal(size=(count, 2)))
@@ -56,23 +56,15 @@ def run(fit: FieldFit) -> None:
         each[:, [X, Y, SIZE]] += 0.05 * rng.normal(size=(len(each), 3))
         field = empty.of(each).with_free(slice(HARMONIC, HOLE + 1))
         fitted = fit.evaluate(field, field.join(each), fit.likely, data)
-        assert fitted is not None
         assert np.isfinite(fit.jacobian(fitted, data)).all()
         field.sampled(each, field.x_m, field.y_m, 1e-3)
         for k in range(len(each)):
-            background = fit.background(fitted, [k], data)
-            own = empty.of(each[k : k + 1])
-            if background is None:
-                continue
-            alone = fit.evaluate(own, own.join(own.fixed), fit.likely, data, background=background)
-            assert alone is not None
-            assert np.isfinite(fit.jacobian(alone, data)).all()
-            own.fixed[:, [X, Y]] = each[1 - k, [X, Y]] if len(each) > 1 else 0.0
-            fit.evaluate(own, own.join(own.fixed), fit.likely, data, background=background)
+            others = empty.of(np.delete(each, k, axis=0)).with_free(slice(PEAK, HOLE))
+            fewer = others.draw(others.join(others.fixed))
+            assert all(np.isfinite(one).all() for one in fit.step_to(fitted, fewer, data))
     level_set = LevelSet(fit.forward)
     likeness = np.clip(1 - np.hypot(empty.x_m, empty.y_m) / 0.016, 0, 1)
     fitted = fit.evaluate(level_set, level_set.parameters_of(likeness), fit.likely, data)
-    assert fitted is not None
     assert np.isfinite(fit.jacobian(fitted, data)).all()
     assert np.isfinite(fit.forward.bare_jacobian()).all()
     with suppress(np.linalg.LinAlgError):

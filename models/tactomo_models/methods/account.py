@@ -182,10 +182,9 @@ def _stepped(
     for step, damping in steps:
         parameters, ratio = fitted.parameters + step[:-1], fitted.log_ratio + float(step[-1])
         trial = fit.evaluate(fitted.family, parameters, ratio, frame.measured)
-        if trial is not None:
-            frame.budget.spend(trial)
-            if trial.cost < fitted.cost:
-                return replace(trial, damping=max(damping / 5, 1e-3))
+        frame.budget.spend(trial)
+        if trial.cost < fitted.cost:
+            return replace(trial, damping=max(damping / 5, 1e-3))
     return None
 
 

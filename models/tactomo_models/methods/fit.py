@@ -285,7 +285,6 @@ class Fit:
         family = last.family.with_peaks_alone(last.parameters)
         parameters = family.join(family.fixed)
         held = self._field_fit.evaluate(family, parameters, last.log_ratio, measurement.data)
-        assert held is not None
         steps = 3  # pressures alone are nearly linear
         return self._field_fit.refine(held, measurement.data, Budget(1.0), 0.0, steps)
 

@@ -41,6 +41,13 @@ class Foreseen:
     own: IntArray  # (m,) which were asked about
     every_sigma: FloatArray  # (K, COLUMNS) standard uncertainties; 0 of what is not fitted
 
+    start: FloatArray  # (K, COLUMNS) all contacts where it was foreseen from
+
+    @property
+    def begun(self) -> Foreseen:
+        """The same, where it was foreseen from."""
+        return replace(self, every=self.start)
+
     @property
     def contacts(self) -> FloatArray:
         """(m, COLUMNS) contacts that were asked about."""
@@ -72,15 +79,18 @@ def foreseen(
     family = field.of(each, fits_peaks=frame.fits_peaks)
     is_own = np.isin(np.arange(family.count), own)
     alone = replace(family, free=family.free & is_own[:, None])
-    step, by_own, by_ratio = fit.step_to(account.fitted, alone.draw(alone.join(each)), frame.measured)
+    step, by_own, by_ratio = fit.step_to(
+        account.fitted, alone.draw(alone.join(each)), frame.measured
+    )
     jacobian = np.empty((len(step), len(family.join(each)) + 1))
     kept = np.delete(old.index, k, axis=0)
     jacobian[:, family.index[~is_own][family.free[~is_own]]] = account.jacobian[:, kept[kept >= 0]]
     jacobian[:, family.index[own][family.free[own]]] = by_own
     jacobian[:, -1] = account.jacobian[:, -1] + by_ratio
-    below = is_own & light
     residual, log_ratio = account.fitted.residual + step, account.fitted.log_ratio
-    at = _At(family, family.bounded(family.join(each)), log_ratio, residual, jacobian, is_own & light)
+    at = _At(
+        family, family.bounded(family.join(each)), log_ratio, residual, jacobian, is_own & light
+    )
     return _end(fit, at, frame, own)
 
 
@@ -157,7 +167,8 @@ def _end(fit: FieldFit, at: _At, frame: Frame, own: IntArray) -> Foreseen:
     sigmas = np.zeros(family.free.shape)
     sigmas[family.free] = np.sqrt(np.diag(np.linalg.inv(hessian))[:-1])
     log_ratio = at.log_ratio + float(step[-1])
-    return Foreseen(found, family.split(parameters), log_ratio, gain, own, sigmas)
+    ends = family.split(at.parameters), family.split(parameters)
+    return Foreseen(found, ends[1], log_ratio, gain, own, sigmas, ends[0])
 
 
 def _newton(fit: FieldFit, at: _At, normal: FloatArray, gradient: FloatArray) -> FloatArray:

@@ -100,7 +100,6 @@ class LevelSetFit:
         """The shapes on the structure sheet, and in words what they came from."""
         mu, likely = self._level_set.prior_mean, self._fit.likely
         nothing = self._fit.evaluate(self._level_set, mu, likely, outlines)
-        assert nothing is not None
         shapes, how = nothing, "cold start"
         if last is not None:
             warm = self._fit.compare(last.shapes, outlines)
@@ -152,7 +151,6 @@ class LevelSetFit:
             peaks = last.fitted.parameters[-len(peaks) :]
         parameters = np.append(shapes.parameters, peaks)
         fitted = self._fit.evaluate(family, parameters, shapes.log_ratio, measured)
-        assert fitted is not None  # the structure sheet was solved for as many nodes
         fitted = self._fit.refine(fitted, measured, budget, 0.0)
         return replace(fitted, converged=fitted.converged and shapes.converged)
 

@@ -9,13 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from tactomo_models.arrays import FloatArray
-from tactomo_models.methods.kinds import SHARES, Kind, as_kind, kind_of
 from tactomo_models.methods.foreseen import Foreseen
+from tactomo_models.methods.kinds import SHARES, Kind, as_kind, kind_of
 from tactomo_models.scene.field_account import Alternative
-from tactomo_models.scene.parameters import COLUMNS
 
 OPEN = -3.0  # logarithm of odds: a rival above is asked again once others have become another kind
 
@@ -70,9 +67,7 @@ def to_be_asked(kind: Kind, rivals: Rivals) -> bool:
     return kind not in rivals or rivals[kind].is_open
 
 
-def rival_of(
-    found: Foreseen, log_odds: float, contact: FloatArray, before: Rival | None
-) -> Rival:
+def rival_of(found: Foreseen, log_odds: float, contact: FloatArray, before: Rival | None) -> Rival:
     """What is foreseen of a rival; of one that was asked before, the mean of both.
 
     A mean and no sum: where a contact stays, errors of the sheet repeat themselves.

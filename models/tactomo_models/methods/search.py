@@ -22,9 +22,9 @@ from tactomo_protocol import Channel
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.methods.account import Account, Frame, account_of, descended
 from tactomo_models.methods.contact_search import ContactSearch
+from tactomo_models.methods.foreseen import Foreseen, at_end, foreseen
 from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
 from tactomo_models.methods.rivals import (
-    OPEN,
     Rivals,
     choices,
     opened,
@@ -33,8 +33,6 @@ from tactomo_models.methods.rivals import (
     turned,
     unasked,
 )
-from tactomo_models.methods.foreseen import Foreseen, at_end, foreseen
-from tactomo_models.methods.trial import FAR_STEPS, HOPELESS, gaps_between
 from tactomo_models.scans.stillness import Since, are_still
 from tactomo_models.scene.field_account import Alternative
 from tactomo_models.scene.field_fit import COLD_S, FieldFit, Measured
@@ -52,8 +50,13 @@ LIKELIER = (
 # may be none. With every contact asked for both, cold frames take a third longer.
 LONG, KNOWN_SIZE = 0.1, 0.25
 FEW_STEPS = 4  # of starts that are compared: a start's cost says little before
+# Of a fit in one go, before what is left is looked at; of one that is unexplained, which may have
+# far to go.
+STEPS, FAR_STEPS = 4, 20
+HOPELESS = -6.0  # logarithm of odds: what is foreseen below is not solved for
+SURE_STEPS = 6  # of a fit of two contacts from afar, before what it foresees is believed
+# Of chi-squared: what the Jacobian foresees of a last step is taken for true, without a solve.
 FORESEEN = 0.5
-STEPS = 4  # of a fit in one go, before what is left is looked at
 # Chi-squared over the count of data, from which a contact is missing rather than of another kind.
 SURPRISE = 2.0
 ROUNDS = 4  # of questions, each after what the last one changed
@@ -436,21 +439,29 @@ class Search:
         """Ask a contact whether it is of other kinds."""
         account = belief.account
         mine, now = dict(belief.rivals[k]), at_end(self.fit, account, frame)
+        explains_little = account.chi_squared > SURPRISE * frame.likelihood.count
         for kind in kinds:
             found = foreseen(self.fit, self.field, account, k, kind, frame)
-            if found.log_evidence - now.log_evidence > HOPELESS:
-                found = self._checked(found, now.log_evidence + OPEN, frame)
+            # Of two contacts in place of one that explains little the Jacobian foresees nothing.
+            is_far = kind is Kind.TWO and explains_little
+            if is_far:
+                found = found.begun
+            if is_far or found.log_evidence - now.log_evidence > HOPELESS:
+                found = self._checked(found, now, FAR_STEPS if is_far else STEPS, frame)
             log_odds = found.log_evidence - now.log_evidence
             mine[kind] = rival_of(found, log_odds, account.contacts[k], mine.get(kind))
         rivals = (*belief.rivals[:k], mine, *belief.rivals[k + 1 :])
         return replace(belief, rivals=rivals)
 
-    def _checked(self, found: Foreseen, least: float, frame: Frame) -> Foreseen:
+    def _checked(self, found: Foreseen, now: Foreseen, steps: int, frame: Frame) -> Foreseen:
         """What was foreseen, by solves from where it ends, as long as it is open."""
         solved = self._account(found.every, found.log_ratio, frame)
         found = at_end(self.fit, solved, frame, found.own)
-        for _ in range(STEPS):
-            if found.gain * solved.unit < FORESEEN or found.log_evidence < least:
+        for taken in range(steps):
+            is_hopeless = found.log_evidence - now.log_evidence < HOPELESS
+            is_sure = steps == STEPS or taken >= SURE_STEPS
+            # A step that would lose is cut at a limit: the end is still far.
+            if 0 <= found.gain * solved.unit < FORESEEN or (is_hopeless and is_sure):
                 break
             solved = self._descended(solved, frame, 1)
             found = at_end(self.fit, solved, frame, found.own)
@@ -593,7 +604,6 @@ class Search:
         fitted = self.fit.evaluate(
             family, family.bounded(family.join(each)), log_ratio, frame.measured
         )
-        assert fitted is not None  # nothing is frozen
         frame.budget.spend(fitted)
         return account_of(self.fit, fitted, frame)
 
@@ -610,6 +620,14 @@ def _is_light(account: Account) -> bool:
 
 def _touching(contacts: FloatArray, near_m: float) -> Iterator[list[int]]:
     """Groups of contacts whose outlines are so near to each other, the largest group first."""
-    count, group = connected_components(gaps_between(contacts) < near_m)
+    count, group = connected_components(_gaps_between(contacts) < near_m)
     groups = [np.flatnonzero(group == number).tolist() for number in range(count)]
     yield from sorted((one for one in groups if len(one) > 1), key=len, reverse=True)
+
+
+def _gaps_between(contacts: FloatArray) -> FloatArray:
+    """Distances (K, K) between outlines of contacts (K, COLUMNS), m, about."""
+    place = contacts[:, [X, Y]] * UNIT_M
+    reach = np.exp(contacts[:, SIZE] + np.hypot(*contacts[:, [E1, E2]].T))
+    apart = np.linalg.norm(place[:, None] - place, axis=2)
+    return np.asarray(apart - reach[:, None] - reach)

@@ -22,7 +22,6 @@ _ARRAYS = (
     *("closed", "gradient", "stiffness", "area", "conductivity", "at_rest", "potentials"),
     *("transfer", "bare_voltages", "electrodes", "pair", "product", "product_of", "sign"),
 )
-_TOUCHES = 2  # what `find_areas` returns where areas touch frozen ones
 
 _Fields = tuple[tuple[str, type], ...]
 
@@ -50,20 +49,8 @@ class _Areas(ctypes.Structure):
     _fields_ = (
         *_integers("triangles", "nodes", "layers", "rim", "near", "is_known"),
         *_addresses("triangle", "corner", "node", "start", "depth", "layer"),
-        *_addresses("both", "bare", "taken"),
+        *_addresses("both", "bare"),
     )
-
-
-class _Frozen(ctypes.Structure):
-    _fields_ = (
-        *_integers("rim", "near", "areas"),
-        *_addresses("rim_node", "near_node", "inside", "rim_start", "near_start", "law"),
-        *_addresses("factors", "pivots", "injected", "transfer"),
-    )
-
-
-class _Green(ctypes.Structure):
-    _fields_ = _addresses("own", "outward", "inward")
 
 
 class _Pressing(ctypes.Structure):
@@ -153,14 +140,13 @@ class CompiledAreas:
 
     Attributes:
         where: (p,) pressable nodes that they are around.
-        frozen: areas beside them that stay as they are.
         found: the same for C.
         nodes: (n,) positions of their nodes in `BareSheet.support`.
         rim, near: (r,) positions of those on rims, (m,) of those and of their neighbours.
     """
 
-    def __init__(self, sheet: _Sheet, where: IntArray, frozen: FrozenAreas | None) -> None:
-        self.where, self.frozen = where, frozen
+    def __init__(self, sheet: _Sheet, where: IntArray) -> None:
+        self.where = where
         most = min(sheet.triangles, len(where) * sheet.most_around)
         nodes = min(sheet.support, 3 * most)
         sizes = np.array([most, 3 * most, nodes, nodes + 1, nodes, nodes])
@@ -168,50 +154,18 @@ class CompiledAreas:
         starts = (sizes.cumsum() - sizes).tolist()
         place = address(self._kept)
         self.found = _Areas(0, 0, 0, 0, 0, 0, *(place + 8 * start for start in starts))
-        of = None if frozen is None else frozen.address
-        made = LIBRARY.find_areas(
-            ctypes.byref(sheet), of, len(where), at(where), ctypes.byref(self.found)
+        _check(
+            LIBRARY.find_areas(ctypes.byref(sheet), len(where), at(where), ctypes.byref(self.found))
         )
-        self.touch = made == _TOUCHES  # those that are frozen
-        if self.touch:
-            return
-        _check(made)
         rim = self.found.rim
         count = self.found.nodes
         self.nodes = self._kept[starts[2] : starts[2] + count]
         depth = self._kept[starts[4] : starts[4] + count]
         self.rim, self.near = self.nodes[depth == 0], self.nodes[depth <= 1]
-        width, others = rim + sheet.fields, 0 if frozen is None else len(frozen.rim)
-        self._known = np.empty(2 * rim * width + others * rim)
+        width = rim + sheet.fields
+        self._known = np.empty(2 * rim * width)
         self.found.both = place = address(self._known)
         self.found.bare = place + 8 * rim * width
-        self.found.taken = place + 16 * rim * width
-
-
-class FrozenAreas:
-    """Areas that stay as they are while others beside them are pressed: see `inner_loop.c`.
-
-    Attributes:
-        rim, near: (r,) positions in `BareSheet.support` of their rims, (m,) of those and of their
-            neighbours.
-        inside: (S,) which nodes belong to them.
-        found: the same for C, still to be filled in.
-    """
-
-    def __init__(self, sheet: _Sheet, areas: CompiledAreas) -> None:
-        rim, most = len(areas.rim), areas.found.layers + 1
-        self.rim: IntArray = areas.rim
-        self.near: IntArray = areas.near
-        self.inside = np.zeros(sheet.support, bool)
-        self.inside[areas.nodes] = True
-        self.injected = np.empty((sheet.fields, rim))
-        self.transfer = np.zeros((sheet.fields + 1, sheet.fields + 1))
-        self._starts, self._pivots = np.empty((2, most), np.int64), np.empty(rim, np.intc)
-        self._law, self._factors = np.empty(rim * len(areas.near)), np.empty((rim, rim))
-        arrays = (self.rim, self.near, self.inside, *self._starts)
-        more = (self._law, self._factors, self._pivots, self.injected, self.transfer)
-        self.found = _Frozen(rim, len(self.near), 0, *map(address, (*arrays, *more)))
-        self.address: object = ctypes.byref(self.found)  # for C
 
 
 @dataclass(frozen=True)
@@ -219,8 +173,7 @@ class Solution:
     """Voltages of one pressed sheet, with what its potentials and derivatives follow from."""
 
     voltages: FloatArray  # (M,) in scan order, relative (multiply by `ForwardModel.volts_per_unit`)
-    # (n,) positions in `BareSheet.support` of the corners of all triangles that changed; not of
-    # those in frozen areas
+    # (n,) positions in `BareSheet.support` of the corners of all triangles that changed
     nodes: IntArray
     potentials: FloatArray  # (n, L - 1) potentials there
     rim: IntArray  # (r,) positions in `BareSheet.support` of those that other triangles touch, too
@@ -275,22 +228,18 @@ class CompiledSheet:
         self._even = np.ones(self._sheet.voltages)
         self._last: CompiledAreas | None = None
 
-    def areas(self, where: IntArray, frozen: FrozenAreas | None = None) -> CompiledAreas:
+    def areas(self, where: IntArray) -> CompiledAreas:
         """Areas around pressable nodes; those of the last solve where these are the very same."""
         last = self._last
-        if last is not None and last.frozen is frozen and np.array_equal(last.where, where):
+        if last is not None and np.array_equal(last.where, where):
             return last
-        return CompiledAreas(self._sheet, np.ascontiguousarray(where, np.int64), frozen)
+        return CompiledAreas(self._sheet, np.ascontiguousarray(where, np.int64))
 
-    def _green(self, areas: CompiledAreas) -> tuple[_Green, list[FloatArray]]:
-        """Blocks of a Green's function that is in pieces, for C; none where C can look them up."""
+    def _green(self, areas: CompiledAreas) -> FloatArray | None:
+        """Blocks of a Green's function that is in pieces, for C; None where C can look them up."""
         if isinstance(self._bare.green, PackedGreensFunction) or areas.found.is_known:
-            return _Green(), []
-        wanted = [(areas.near, areas.rim)]
-        if areas.frozen is not None:
-            wanted += [(areas.near, areas.frozen.rim), (areas.frozen.near, areas.rim)]
-        blocks = [np.ascontiguousarray(self._bare.green.between(*pair)) for pair in wanted]
-        return _Green(*map(address, blocks)), blocks
+            return None
+        return np.ascontiguousarray(self._bare.green.between(areas.near, areas.rim))
 
     def solve(
         self,
@@ -316,10 +265,9 @@ class CompiledSheet:
         Raises:
             numpy.linalg.LinAlgError: a conductivity is not above 0.
         """
-        found, sheet, frozen = areas.found, self._sheet, areas.frozen
-        lead = found.rim + (0 if frozen is None else len(frozen.rim))
+        found, sheet = areas.found, self._sheet
         sizes = (sheet.pressable, sheet.voltages, sheet.voltages, found.nodes * sheet.fields)
-        kept = np.empty(sum(sizes) + lead * sheet.fields)
+        kept = np.empty(sum(sizes) + found.rim * sheet.fields)
         ends = np.cumsum(sizes).tolist()
         place = address(kept)
         if change is not None:
@@ -328,60 +276,28 @@ class CompiledSheet:
         pressing.change = place
         pressing.voltages, pressing.residual = place + 8 * ends[0], place + 8 * ends[1]
         pressing.potentials, pressing.injected = place + 8 * ends[2], place + 8 * ends[3]
-        green, blocks = self._green(areas)
+        green = self._green(areas)
         made = LIBRARY.evaluate(
             self._address,
             ctypes.byref(found),
-            None if frozen is None else frozen.address,
-            ctypes.byref(green),
+            None if green is None else at(green),
             None if pressed is None else pressed.response.address,
             None if data is None else data.address,
             ctypes.byref(pressing),
         )
-        del blocks  # which C has read
         _check(made)
         self._last = areas
-        rim = areas.rim if frozen is None else np.concatenate([areas.rim, frozen.rim])
         solution = Solution(
             kept[ends[0] : ends[1]],
             areas.nodes,
             kept[ends[2] : ends[3]].reshape(-1, sheet.fields),
-            rim,
-            kept[ends[3] :].reshape(sheet.fields, lead).T,
+            areas.rim,
+            kept[ends[3] :].reshape(sheet.fields, found.rim).T,
             areas,
             kept[: ends[0]],
             bool(pressing.mixes_resistivities),
         )
         return solution, kept[ends[1] : ends[2]]
-
-    def freeze(self, areas: CompiledAreas, pressed: Pressed) -> FrozenAreas:
-        """Keep what is pressed as it is.
-
-        Args:
-            areas: around it.
-            pressed: what presses.
-
-        Raises:
-            numpy.linalg.LinAlgError: a conductivity is not above 0.
-        """
-        frozen, change = FrozenAreas(self._sheet, areas), np.empty(self._sheet.pressable)
-        pressing = _pressing(pressed, areas.where, False)
-        pressing.change = address(change)
-        green, blocks = self._green(areas)
-        made = LIBRARY.freeze(
-            self._address,
-            ctypes.byref(areas.found),
-            ctypes.byref(green),
-            pressed.response.address,
-            ctypes.byref(pressing),
-            frozen.address,
-        )
-        del blocks  # which C has read
-        _check(made)
-        self._last, bare = areas, self._bare
-        frozen.transfer[:] = bare.transfer
-        frozen.transfer[:-1, :-1] += bare.potentials[frozen.rim].T @ frozen.injected.T
-        return frozen
 
     def slopes(
         self,

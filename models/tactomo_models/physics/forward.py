@@ -11,13 +11,6 @@ rims inject currents i into the bare sheet (Woodbury identity):
 
 The cost goes by the pressed area, not by the size of the sheet.
 
-Areas o may be frozen while another, k, changes. They answer potentials u, which all else makes
-there, with currents -A u, where E picks the rows of rims and L is the law of the bare triangles:
-
-    A = (1 + (S_o - S0_o) G_oo)^-1 (S_o E - L)
-
-To k the sheet with them is a bare one of G_kk - G_ko A G_ok and u0_k - G_ko A u0_o.
-
 Everything is relative to a sheet of unit conductance: conductivities are ratios to the bare
 sheet's, transfer resistances are in units of the bare sheet's resistance per square.
 
@@ -34,13 +27,12 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.physics.bare_sheet import BareSheet, scan_voltages, volts_per_unit
 from tactomo_models.physics.compiled_sheet import (
     CompiledAreas,
     CompiledData,
     CompiledSheet,
-    FrozenAreas,
     Pressed,
     Solution,
 )
@@ -184,47 +176,20 @@ class ForwardModel:
             0
         ]
 
-    def evaluate(
-        self, pressed: Pressed, data: CompiledData, frozen: FrozenAreas | None = None
-    ) -> tuple[Solution, FloatArray] | None:
+    def evaluate(self, pressed: Pressed, data: CompiledData) -> tuple[Solution, FloatArray]:
         """Solve for what is pressed and compare its relative voltage changes with data.
 
         Args:
             pressed: what presses, and what that does to the sheet.
             data: what was measured.
-            frozen: areas beside it that are pressed, too, and stay as they are; see `freeze`.
 
         Returns:
-            The solution, and the weighted residual (M,) of the data; None where what is pressed
-            touches frozen areas.
+            The solution, and the weighted residual (M,) of the data.
 
         Raises:
             numpy.linalg.LinAlgError: a conductivity is not above 0.
         """
-        areas = self._compiled.areas(pressed.where, frozen)
-        return None if areas.touch else self._compiled.solve(areas, pressed, data)
-
-    def freeze(self, pressed: Pressed, beside: IntArray, margin: int) -> FrozenAreas | None:
-        """Keep what is pressed as it is, for solves of what presses beside it.
-
-        Args:
-            pressed: what presses, and what that does to the sheet.
-            beside: (p,) pressable nodes that will be pressed.
-            margin: so many nodes more than the area around these must be free.
-
-        Returns:
-            The areas; None where these nodes are too near.
-
-        Raises:
-            numpy.linalg.LinAlgError: a conductivity is not above 0.
-        """
-        areas, grown = self._compiled.areas(pressed.where), self._compiled.areas(beside).nodes
-        for _ in range(margin):
-            grown = np.unique(self._neighbours[grown])
-            grown = grown[grown < len(self.bare.support)]
-        if np.isin(grown, areas.nodes).any():
-            return None
-        return self._compiled.freeze(areas, pressed)
+        return self._compiled.solve(self._compiled.areas(pressed.where), pressed, data)
 
     def slopes(
         self,
@@ -260,16 +225,9 @@ class ForwardModel:
         return areas, self.potentials(solution, areas.nodes)
 
     def potentials(self, solution: Solution, nodes: IntArray) -> FloatArray:
-        """Potentials (n, L - 1) of a pressed sheet at n positions in `BareSheet.support`.
-
-        Raises:
-            ValueError: some are inside frozen areas.
-        """
+        """Potentials (n, L - 1) of a pressed sheet at n positions in `BareSheet.support`."""
         position = _positions(solution.nodes, len(self.bare.support))[nodes]
         outside = position < 0
-        frozen = solution.areas.frozen
-        if frozen is not None and (frozen.inside & ~_there(solution.rim, frozen))[nodes].any():
-            raise ValueError("potentials inside frozen areas are not known: solve all together")
         potentials = np.empty((len(nodes), self.bare.potentials.shape[1]))
         potentials[~outside] = solution.potentials[position[~outside]]
         others = nodes[outside]
@@ -338,13 +296,6 @@ class ForwardModel:
         """Jacobian of the unpressed sheet, (M, P)."""
         unpressed = self.solve(np.zeros(len(self.bare.pressable)))
         return self.jacobian(unpressed, np.arange(len(self.bare.pressable)))
-
-
-def _there(members: IntArray, frozen: FrozenAreas) -> BoolArray:
-    """Tell which nodes (S,) are among some."""
-    there = np.zeros_like(frozen.inside)
-    there[members] = True
-    return there
 
 
 def _assembled(stiffness: FloatArray, corners: IntArray, nodes: int) -> sp.csr_matrix:

@@ -15,7 +15,7 @@ Jacobian go by the pressed area.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
@@ -24,7 +24,7 @@ import numpy as np
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
-from tactomo_models.physics.compiled_sheet import FrozenAreas, Pressed, Solution
+from tactomo_models.physics.compiled_sheet import Pressed, Solution
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scans.changes import Changes
 from tactomo_models.scans.companion_forces import SheetsAndCompanions
@@ -46,10 +46,6 @@ SHEET_S = 1.6e-4  # a step on one sheet
 ENTRY_S = 3.7e-8  # the same, for each node that is pressed and each parameter
 MAX_DAMPING = 1e6  # no step downhill even at this: a minimum
 STEP_LIMIT = 0.5  # largest change of a parameter in one step
-# Nodes that a contact must have to move in before it would touch those that are frozen: on the
-# paper's sensor (3 mm each) outlines 15 mm apart may be frozen, 12 with one node, 21 with four.
-# What a trial says does not depend on it.
-APART = 1
 
 Measured = Mapping[Channel, Changes]
 
@@ -73,17 +69,6 @@ class Family(Protocol):
 
 
 @dataclass(frozen=True)
-class Background:
-    """Contacts of a pressure field that stay as they are while another one is fitted."""
-
-    family: PressureField  # what their parameters mean
-    parameters: FloatArray  # (N,) of the family
-    drawing: Drawing = field(repr=False)  # the contacts on the nodes
-    sheets: Mapping[Channel, FrozenAreas] = field(repr=False)
-    away: float  # what they add to the cost: by what is likely of them
-
-
-@dataclass(frozen=True)
 class FittedField:
     """An estimate of what presses."""
 
@@ -95,7 +80,6 @@ class FittedField:
     # each sheet's (M,) noise-weighted misfit of the data
     residuals: Mapping[Channel, FloatArray] = field(repr=False)
     cost: float  # what is minimised, the prior included
-    background: Background | None = field(default=None, repr=False)  # contacts beside it
     damping: float = 1.0  # Levenberg-Marquardt damping that its last step got through with
     # (K,) of companions, likewise weighted
     companion_residuals: FloatArray = field(default_factory=lambda: np.zeros(0), repr=False)
@@ -192,9 +176,7 @@ class FieldFit:
                 fitted.log_ratio,
                 measured,
                 solved=fitted.solutions,
-                background=fitted.background,
             )
-            assert again is not None
             return again
         judged = self._judged(
             fitted.family,
@@ -202,7 +184,6 @@ class FieldFit:
             fitted.log_ratio,
             fitted.drawing,
             *self._compared(fitted, measured),
-            fitted.background,
             measured,
         )
         return replace(judged, damping=1.0 if fitted.converged else fitted.damping)
@@ -214,13 +195,10 @@ class FieldFit:
         log_ratio: float,
         measured: Measured,
         solved: Mapping[Channel, Solution] | None = None,
-        background: Background | None = None,
-    ) -> FittedField | None:
+    ) -> FittedField:
         """Solve the forward model for given parameters and compare it with the data.
 
-        None where it would touch the background's contacts. Sheets that are `solved` for these
-        very contacts and ratio are not solved again. With a background the voltages, residuals and
-        cost are those of all contacts together; parameters are those of the ones not frozen.
+        Sheets that are `solved` for these very contacts and ratio are not solved again.
         """
         drawing = family.draw(parameters)
         solutions: dict[Channel, Solution] = {}
@@ -230,14 +208,11 @@ class FieldFit:
                 solutions[name] = solved[name]
                 residuals[name] = self._residual(name, solved[name], changes)
                 continue
-            frozen = None if background is None else background.sheets[name]
             pressed = self._pressed(name, drawing, log_ratio)
-            made = self.sheet(name).evaluate(pressed, changes.compiled, frozen)
-            if made is None:
-                return None
+            made = self.sheet(name).evaluate(pressed, changes.compiled)
             solutions[name], residuals[name] = made
         return self._judged(
-            family, parameters, log_ratio, drawing, solutions, residuals, background, measured
+            family, parameters, log_ratio, drawing, solutions, residuals, measured
         )
 
     def _pressed(self, name: Channel, drawing: Drawing, log_ratio: float) -> Pressed:
@@ -263,17 +238,14 @@ class FieldFit:
         drawing: Drawing,
         solutions: Mapping[Channel, Solution],
         residuals: Mapping[Channel, FloatArray],
-        background: Background | None,
         measured: Measured,
     ) -> FittedField:
         off = (log_ratio - self.likely) / self._ratio_sigma
-        away = _away(family, parameters) + (0.0 if background is None else background.away)
+        away = _away(family, parameters)
         felt = np.zeros(0)
         if isinstance(measured, SheetsAndCompanions):
             weights, readings = measured.rows
             felt = _felt(weights, drawing) - readings
-            if background is not None:
-                felt = felt + _felt(weights, background.drawing)
         cost = sum(each @ each for each in residuals.values()) + felt @ felt + away + off**2
         return FittedField(
             family,
@@ -283,42 +255,8 @@ class FieldFit:
             solutions,
             residuals,
             float(cost),
-            background,
             companion_residuals=felt,
         )
-
-    def background(
-        self, fitted: FittedField, free: Sequence[int], measured: Measured
-    ) -> Background | None:
-        """Freeze all contacts of a pressure field but some, so that trials of those cost little.
-
-        Args:
-            fitted: the field, with `PressureField` as its family and no background of its own.
-            free: the contacts that are not frozen.
-            measured: the sheets whose data trials will be compared with.
-
-        Returns:
-            The others; None where there are none, or where they are too near: an area around the
-            free contacts and two nodes more would touch theirs.
-
-        Raises:
-            ValueError: it is no such field.
-        """
-        family = fitted.family
-        if not isinstance(family, PressureField) or fitted.background is not None:
-            raise ValueError("only a whole pressure field has contacts that can be frozen")
-        (own, alone), (others, frozen) = family.parted(fitted.parameters, free)
-        if others.count == 0:
-            return None
-        beside, drawing = own.draw(alone).nodes, others.draw(frozen)
-        sheets = {}
-        for name in measured:
-            pressed = self._pressed(name, drawing, fitted.log_ratio)
-            areas = self.sheet(name).freeze(pressed, beside, APART)
-            if areas is None:
-                return None
-            sheets[name] = areas
-        return Background(others, frozen, drawing, sheets, _away(others, frozen))
 
     def _compared(
         self, fitted: FittedField, measured: Measured
@@ -356,10 +294,7 @@ class FieldFit:
             )
             sheets.append(by_parameter)
         if isinstance(measured, SheetsAndCompanions):
-            by_pressed = slopes[2].T * drawing.pressure_kpa + slopes[3].T * drawing.share
-            weights = measured.rows[0][:, drawing.nodes]
-            by_ratio = np.zeros((len(weights), 1))  # the same field, whatever a sheet makes of it
-            sheets.append(np.hstack([weights @ by_pressed.T, by_ratio]))
+            sheets.append(_felt_slopes(measured.rows[0], drawing))
         return np.concatenate(sheets)
 
     def jacobian_at_onset(self, fitted: FittedField, measured: Measured) -> FloatArray:
@@ -386,8 +321,8 @@ class FieldFit:
         little field (Ammari & Kang, Springer 2004, polarisation tensors).
 
         Returns:
-            What the weighted residual (sum M,) changes by, its derivative (sum M, N) by the
-            drawing's free parameters, and the change (sum M,) of that by the log ratio.
+            What the weighted residual (sum M + K,) changes by, its derivative (sum M + K, N) by the
+            drawing's free parameters, and the change (sum M + K,) of that by the log ratio.
         """
         slopes, sheets = other.slopes(), []
         for name, changes in measured.items():
@@ -405,6 +340,10 @@ class FieldFit:
             onto = sheet.at_rest[where, None] * columns[where]
             voltages = sheet.jacobian(fitted.solutions[name], where, onto)
             sheets.append(changes.weighted(voltages / np.abs(sheet.bare_voltages)[:, None]))
+        if isinstance(measured, SheetsAndCompanions):
+            weights = measured.rows[0]
+            change = _felt(weights, other) - _felt(weights, fitted.drawing)
+            sheets.append(np.column_stack([change, _felt_slopes(weights, other)]))
         step, by_parameters, by_ratio = np.split(np.concatenate(sheets), [1, -1], axis=1)
         return step[:, 0], by_parameters, by_ratio[:, 0]
 
@@ -484,13 +423,10 @@ class FieldFit:
             step = bounded_step(normal, gradient, damping)
             ratio = self.bounded_ratio(fitted.log_ratio + step[-1])
             parameters = fitted.family.bounded(fitted.parameters + step[:-1])
-            trial = self.evaluate(
-                fitted.family, parameters, ratio, measured, background=fitted.background
-            )
-            if trial is not None:
-                budget.spend(trial)
-                if trial.cost < fitted.cost:
-                    return replace(trial, damping=max(damping / 5, 1e-3), jacobian=J)
+            trial = self.evaluate(fitted.family, parameters, ratio, measured)
+            budget.spend(trial)
+            if trial.cost < fitted.cost:
+                return replace(trial, damping=max(damping / 5, 1e-3), jacobian=J)
             damping *= 5
             if budget.over:
                 break
@@ -511,6 +447,17 @@ def bounded_step(
 def _felt(weights: FloatArray, drawing: Drawing) -> FloatArray:
     """Weighted forces (K,) that companions feel of a drawing; `weights` (K, P) by 1 kPa."""
     return np.asarray(weights[:, drawing.nodes] @ (drawing.share * drawing.pressure_kpa))
+
+
+def _felt_slopes(weights: FloatArray, drawing: Drawing) -> FloatArray:
+    """Derivative (K, N + 1) of that by the drawing's parameters and the log ratio.
+
+    The log ratio leaves it as it is: the field is the same, whatever a sheet makes of it.
+    """
+    _, _, by_share, by_pressure = drawing.slopes()
+    by_pressed = by_share.T * drawing.pressure_kpa + by_pressure.T * drawing.share
+    felt = weights[:, drawing.nodes] @ by_pressed.T
+    return np.column_stack([felt, np.zeros(len(felt))])
 
 
 def _for_c(array: FloatArray) -> FloatArray:

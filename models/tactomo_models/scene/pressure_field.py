@@ -23,7 +23,6 @@ of h / k^2, so that both are those of the contact:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from ctypes import Structure, byref, c_double, c_int64
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
@@ -160,16 +159,6 @@ class PressureField:
         free = np.zeros_like(self.free)
         free[:, PEAK] = True
         return replace(self, fixed=self.split(parameters), free=free)
-
-    def parted(
-        self, parameters: FloatArray, some: Sequence[int]
-    ) -> tuple[tuple[PressureField, FloatArray], tuple[PressureField, FloatArray]]:
-        """Some contacts alone, and all others: their fields and their parameters."""
-        each, is_own = self.split(parameters), np.isin(np.arange(self.count), some)
-        own, others = (
-            replace(self, fixed=each[those], free=self.free[those]) for those in (is_own, ~is_own)
-        )
-        return (own, own.join(own.fixed)), (others, others.join(others.fixed))
 
     @cached_property
     def index(self) -> IntArray:
