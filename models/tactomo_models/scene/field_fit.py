@@ -211,9 +211,7 @@ class FieldFit:
             pressed = self._pressed(name, drawing, log_ratio)
             made = self.sheet(name).evaluate(pressed, changes.compiled)
             solutions[name], residuals[name] = made
-        return self._judged(
-            family, parameters, log_ratio, drawing, solutions, residuals, measured
-        )
+        return self._judged(family, parameters, log_ratio, drawing, solutions, residuals, measured)
 
     def _pressed(self, name: Channel, drawing: Drawing, log_ratio: float) -> Pressed:
         """What presses on a sheet, as the sheet sees it."""
