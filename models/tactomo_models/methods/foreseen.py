@@ -161,11 +161,11 @@ def _end(fit: FieldFit, at: _At, frame: Frame, own: IntArray) -> Foreseen:
     gain = -float((2 * gradient + normal @ step) @ step)
     parameters = at.parameters + step[:-1]
     chi_squared = likelihood.chi_squared(at.residual + J @ step)
-    found, hessian = laplace(
-        likelihood, family, parameters, J, chi_squared, precision, offset + step
-    )
+    found, _ = laplace(likelihood, family, parameters, J, chi_squared, precision, offset + step)
+    # A peak just above the onset is as uncertain as the sheet tells there, not as before any data.
+    information = likelihood.information(J, chi_squared) + np.diag(precision)
     sigmas = np.zeros(family.free.shape)
-    sigmas[family.free] = np.sqrt(np.diag(np.linalg.inv(hessian))[:-1])
+    sigmas[family.free] = np.sqrt(np.diag(np.linalg.inv(information))[:-1])
     log_ratio = at.log_ratio + float(step[-1])
     ends = family.split(at.parameters), family.split(parameters)
     return Foreseen(found, ends[1], log_ratio, gain, own, sigmas, ends[0])
