@@ -388,9 +388,14 @@ class Search:
         if not belief.is_parted and _is_light(account):
             return self._joined(belief, frame)
         for each in PASSES if belief.rounds < ROUNDS else ():
-            asked = self._asked(belief, each, frame)
-            if asked is not None:
-                return asked
+            for k, mine in enumerate(belief.rivals):
+                kinds = [
+                    kind
+                    for kind in self._kinds(account, k, frame)
+                    if kind in each.kinds and to_be_asked(kind, mine)
+                ]
+                if kinds:
+                    return self._asked(belief, k, kinds, frame)
             better = self._decided(belief, each, frame)
             if better is not None:
                 return better
@@ -430,30 +435,23 @@ class Search:
             kinds.append(Kind.TWO)
         return [kind for kind in kinds if kind is not own]
 
-    def _asked(self, belief: Belief, each: Pass, frame: Frame) -> Belief | None:
-        """Ask contacts whether they are of other kinds, as far as the budget lasts; None: all are.
-
-        From afar the Jacobian foresees nothing of two contacts in place of one.
-        """
-        account, now, rivals = belief.account, None, list(belief.rivals)
+    def _asked(self, belief: Belief, k: int, kinds: list[Kind], frame: Frame) -> Belief:
+        """Ask a contact whether it is of other kinds."""
+        account = belief.account
+        mine, now = dict(belief.rivals[k]), at_end(self.fit, account, frame)
         explains_little = account.chi_squared > SURPRISE * frame.likelihood.count
-        for k, mine in enumerate(belief.rivals):
-            for kind in self._kinds(account, k, frame):
-                if kind not in each.kinds or not to_be_asked(kind, mine):
-                    continue
-                if frame.budget.over:
-                    break
-                now = now or at_end(self.fit, account, frame)
-                found = foreseen(self.fit, self.field, account, k, kind, frame)
-                is_far = kind is Kind.TWO and explains_little
-                if is_far:
-                    found = self._checked(found.begun, now, FAR_STEPS, frame)
-                elif found.log_evidence - now.log_evidence > HOPELESS:
-                    found = self._checked(found, now, STEPS, frame)
-                log_odds = found.log_evidence - now.log_evidence
-                rival = rival_of(found, log_odds, account.contacts[k], mine.get(kind))
-                rivals[k] = {**rivals[k], kind: rival}
-        return None if now is None else replace(belief, rivals=tuple(rivals))
+        for kind in kinds:
+            found = foreseen(self.fit, self.field, account, k, kind, frame)
+            # Of two contacts in place of one that explains little the Jacobian foresees nothing.
+            is_far = kind is Kind.TWO and explains_little
+            if is_far:
+                found = found.begun
+            if is_far or found.log_evidence - now.log_evidence > HOPELESS:
+                found = self._checked(found, now, FAR_STEPS if is_far else STEPS, frame)
+            log_odds = found.log_evidence - now.log_evidence
+            mine[kind] = rival_of(found, log_odds, account.contacts[k], mine.get(kind))
+        rivals = (*belief.rivals[:k], mine, *belief.rivals[k + 1 :])
+        return replace(belief, rivals=rivals)
 
     def _checked(self, found: Foreseen, now: Foreseen, steps: int, frame: Frame) -> Foreseen:
         """What was foreseen, by solves from where it ends, as long as it is open."""
