@@ -26,6 +26,7 @@ class Rival:
     difference: FloatArray
     sigmas: FloatArray  # (COLUMNS,) their standard uncertainties
     is_open: bool = False  # whether it is to be asked once more
+    found: Foreseen | None = None  # where it was asked last, all contacts moved with it
 
     @property
     def is_one(self) -> bool:
@@ -75,8 +76,8 @@ def rival_of(found: Foreseen, log_odds: float, contact: FloatArray, before: Riva
     if before is not None:
         log_odds = (log_odds + before.log_odds) / 2
     if len(found.contacts) != 1:
-        return Rival(log_odds, found.contacts, found.sigmas)
-    return Rival(log_odds, found.contacts[0] - contact, found.sigmas[0])
+        return Rival(log_odds, found.contacts, found.sigmas, found=found)
+    return Rival(log_odds, found.contacts[0] - contact, found.sigmas[0], found=found)
 
 
 def turned(rivals: Rivals, kind: Kind, own: Kind, sigmas: FloatArray) -> Rivals:
@@ -87,11 +88,17 @@ def turned(rivals: Rivals, kind: Kind, own: Kind, sigmas: FloatArray) -> Rivals:
             rival,
             log_odds=rival.log_odds - won.log_odds,
             difference=rival.difference - won.difference * rival.is_one,
+            found=None,
         )
         for other, rival in rivals.items()
         if other is not kind
     }
     return others | {own: Rival(-won.log_odds, -won.difference, sigmas)}
+
+
+def in_another_frame(rivals: Rivals) -> Rivals:
+    """The same, without where they were found: in another frame that is elsewhere."""
+    return {kind: replace(one, found=None) for kind, one in rivals.items()}
 
 
 def opened(rivals: Rivals, gain: float) -> Rivals:
@@ -101,5 +108,7 @@ def opened(rivals: Rivals, gain: float) -> Rivals:
     """
     least = min(OPEN, -gain / 2)
     return {
-        kind: one for kind, one in rivals.items() if one.log_odds < least and kind is not Kind.NONE
+        kind: replace(one, found=None)
+        for kind, one in rivals.items()
+        if one.log_odds < least and kind is not Kind.NONE
     }

@@ -27,6 +27,7 @@ from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
 from tactomo_models.methods.rivals import (
     Rivals,
     choices,
+    in_another_frame,
     opened,
     rival_of,
     to_be_asked,
@@ -197,6 +198,7 @@ class Search:
         belief = replace(
             belief,
             account=self._descended(account, frame, STEPS),
+            rivals=tuple(map(in_another_frame, belief.rivals)),
             settled_on=frame.measured,
             since=None,
             frames=frames,
@@ -516,7 +518,11 @@ class Search:
                 rivals.append(turned(mine, kind, kind_of(contact), account.sigmas[k]))
             else:
                 rivals += [{}] * len(start)
-        start = self._account(np.vstack(rows), account.fitted.log_ratio, frame)
+        every, log_ratio = np.vstack(rows), account.fitted.log_ratio
+        alone = [belief.rivals[k][kind].found for k, kind in choice.items()]
+        if len(alone) == 1 and alone[0] is not None:
+            every, log_ratio = alone[0].every, alone[0].log_ratio
+        start = self._account(every, log_ratio, frame)
         changed = self._descended(start, frame, self._steps(account, frame))
         gain = changed.log_evidence - account.log_evidence
         if belief.rounds + 1 < ROUNDS:  # else nobody is asked again
