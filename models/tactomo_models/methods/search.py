@@ -444,6 +444,7 @@ class Search:
         mine, now = dict(belief.rivals[k]), at_end(self.fit, account, frame)
         explains_little = account.chi_squared > SURPRISE * frame.likelihood.count
         for kind in kinds:
+            frame.budget.spend(account.fitted)  # about what foreseeing takes, too
             found = foreseen(self.fit, self.field, account, k, kind, frame)
             # Of two contacts in place of one that explains little the Jacobian foresees nothing.
             is_far = kind is Kind.TWO and explains_little
