@@ -125,7 +125,12 @@ def python_view(frame: Frame) -> dict[str, Any]:
     }
     view["flags"] = sorted(frame.flags)
     view["contacts"] = [
-        {**dataclasses.asdict(contact), "exceeds_150": contact.exceeds(150).value}
+        {
+            **dataclasses.asdict(contact),
+            "exceeds_150": contact.exceeds(150).value,
+            "frame": contact.frame or None,
+            **{name: listed(getattr(contact, name)) for name in ("position_m", "normal")},
+        }
         for contact in frame.contacts
     ]
     for name in IMAGES:
@@ -147,7 +152,13 @@ def cpp_view(said: dict[str, Any]) -> dict[str, Any]:
     )  # they go by the time at which they are asked for
     for name in ("tier", "tier_reason", "dated_by"):
         view[name] = said[name] or None
+    view["contacts"] = [{**each, "frame": each["frame"] or None} for each in said["contacts"]]
     return view
+
+
+def listed(point: tuple[float, ...] | None) -> list[float] | None:
+    """A point as JSON has it."""
+    return None if point is None else list(point)
 
 
 @pytest.mark.slow

@@ -56,6 +56,11 @@ class Auto(Fit):
         areas = finder.find(pressed, finder.on_nodes(pressed))
         return ellipses_of(areas.on_map, *finder.map_places, self._search.field.typical_peak)
 
+    def _shows_any(self, made: Estimate) -> bool:
+        """Whether an estimate shows a contact."""
+        finder, shown = self._skin.areas, made.structure
+        return shown is not None and len(finder.find(shown, finder.on_nodes(shown))) > 0
+
     def _concluded(self, course: Course, measurement: Measurement) -> Estimate:
         own = super()._concluded(course, measurement)
         assert course.belief is not None
@@ -68,5 +73,7 @@ class Auto(Fit):
         # It has learnt scenes that no few contacts describe; but where data are left unexplained,
         # sheets may contradict each other, and no network is sure enough to hide that.
         made = network_estimate(self._skin, measurement, "no pressure field explains the data")
+        if len(own.areas or ()) and not self._shows_any(made):
+            return own  # what is felt is not hidden
         flags, at_rest = made.flags | own.flags, course.at_rest
         return replace(made, misfit=own.misfit, flags=flags, carried=course, lasting=at_rest)

@@ -5,10 +5,10 @@
 A frame that is of the same scene leaves the belief as it is. Else contacts are moved on as they
 last moved, and fitted to all sheets at once. Where that does not explain the data, what is left of
 the contacts, what is missing beside them and a cold start compete. Then each contact is asked by
-itself what it is: even, rounded, a ring, falling towards the edge, two contacts, or none. What each
-would come to is foreseen without a solve (`foreseen`), and solved for once where that is likely. The
-evidence decides, and what it leaves open is kept as rivals, whose share is part of what is shown.
-What one frame's budget does not finish, the next one goes on with.
+itself what it is: even, rounded, a ring, falling towards the edge, two contacts, or none. What
+each would come to is foreseen without a solve (`foreseen`), and solved for where that is likely.
+The evidence decides, and what it leaves open is kept as rivals, whose share is part of what is
+shown. What one frame's budget does not finish, the next one goes on with.
 """
 
 from __future__ import annotations

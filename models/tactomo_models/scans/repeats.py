@@ -56,4 +56,5 @@ def is_noisy(reference: Reference | None, channel: str, scan: FloatArray) -> boo
     noise: Any = getattr(reference, f"{channel}_noise", None)
     if reference is None or not reference.is_noise_measured or noise is None:
         return False
-    return float(np.median(noise)) > 0 and bool(np.any(noise > 1e-12 * np.abs(scan)))
+    differs = bool(2 * np.count_nonzero(noise) > len(noise))
+    return differs and bool(np.any(noise > 1e-12 * np.abs(scan)))

@@ -1,6 +1,6 @@
 // Draws a mounted sheet on its surface: the image, contacts with arrows of force, and presses. It is
 // turned by dragging beside the sheet or with the right button, zoomed by the wheel, and pressed as
-// the flat map is. Drawn by three.js (three.module.min.js, MIT, https://threejs.org).
+// the flat map is. Drawn by three.js (three.module.min.js, MIT).
 
 import * as THREE from "./three.module.min.js";
 
