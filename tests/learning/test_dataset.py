@@ -21,6 +21,7 @@ from recorded_grasp import (
     images_of,
     write_grasp,
 )
+from tactomo_client.schema import table_row
 from tactomo_client.touch import CONTACT_COLUMNS
 
 pytestmark = pytest.mark.peers
@@ -83,7 +84,7 @@ def test_maps_and_contacts_are_the_recorded_ones(tactomo: Run, tmp_path: Path) -
     for number in (FIRST_PRESSED, LIGHT_FROM + 5):
         for slot, contact in enumerate(contacts_of(number)):
             for column, name in enumerate(CONTACT_COLUMNS):
-                value = getattr(contact, name)
+                value = table_row(contact)[name]
                 if name == "pressure_range":
                     value = {"within": 1, "below": 2}[value]
                 assert is_number[number, slot, column] == (value is not None)
