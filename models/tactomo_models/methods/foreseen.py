@@ -41,13 +41,6 @@ class Foreseen:
     own: IntArray  # (m,) which were asked about
     every_sigma: FloatArray  # (K, COLUMNS) standard uncertainties; 0 of what is not fitted
 
-    start: FloatArray  # (K, COLUMNS) all contacts where it was foreseen from
-
-    @property
-    def begun(self) -> Foreseen:
-        """The same, where it was foreseen from."""
-        return replace(self, every=self.start)
-
     @property
     def contacts(self) -> FloatArray:
         """(m, COLUMNS) contacts that were asked about."""
@@ -72,10 +65,8 @@ def foreseen(
         kind: what it is instead.
         frame: the data.
     """
-    light = bool(account.is_hardly_pressed[k])
-    contacts = start_of(fit, field, account.contacts[k], kind, is_light=light)
-    old, own = account.family, np.arange(k, k + len(contacts))
-    each = np.vstack([account.contacts[:k], contacts, account.contacts[k + 1 :]])
+    old, light = account.family, account.is_hardly_pressed[k]
+    each, own = with_kind(fit, field, account, k, kind)
     family = field.of(each, fits_peaks=frame.fits_peaks)
     is_own = np.isin(np.arange(family.count), own)
     alone = replace(family, free=family.free & is_own[:, None])
@@ -92,6 +83,16 @@ def foreseen(
         family, family.bounded(family.join(each)), log_ratio, residual, jacobian, is_own & light
     )
     return _end(fit, at, frame, own)
+
+
+def with_kind(
+    fit: FieldFit, field: PressureField, account: Account, k: int, kind: Kind
+) -> tuple[FloatArray, IntArray]:
+    """All contacts (K, COLUMNS) with one of another kind, to start from; which it is now (m,)."""
+    is_light = bool(account.is_hardly_pressed[k])
+    contacts = start_of(fit, field, account.contacts[k], kind, is_light=is_light)
+    each = np.vstack([account.contacts[:k], contacts, account.contacts[k + 1 :]])
+    return each, np.arange(k, k + len(contacts))
 
 
 def at_end(fit: FieldFit, account: Account, frame: Frame, own: IntArray | None = None) -> Foreseen:
@@ -167,8 +168,7 @@ def _end(fit: FieldFit, at: _At, frame: Frame, own: IntArray) -> Foreseen:
     sigmas = np.zeros(family.free.shape)
     sigmas[family.free] = np.sqrt(np.diag(np.linalg.inv(information))[:-1])
     log_ratio = at.log_ratio + float(step[-1])
-    ends = family.split(at.parameters), family.split(parameters)
-    return Foreseen(found, ends[1], log_ratio, gain, own, sigmas, ends[0])
+    return Foreseen(found, family.split(parameters), log_ratio, gain, own, sigmas)
 
 
 def _newton(fit: FieldFit, at: _At, normal: FloatArray, gradient: FloatArray) -> FloatArray:

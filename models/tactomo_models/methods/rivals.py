@@ -1,7 +1,7 @@
 """Rivals: what else a contact may be than what it is taken for, and by what odds.
 
 A rival is kept as its difference from the contact, so that it moves on with it. Odds are of the
-evidence of both (`trial`); what nobody has asked yet is as likely as before any data.
+evidence of both (`foreseen`); what nobody has asked yet is as likely as before any data.
 """
 
 from __future__ import annotations

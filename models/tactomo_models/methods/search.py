@@ -20,10 +20,10 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from tactomo_protocol import Channel
 
-from tactomo_models.arrays import BoolArray, FloatArray
+from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.methods.account import Account, Frame, account_of, descended
 from tactomo_models.methods.contact_search import ContactSearch
-from tactomo_models.methods.foreseen import Foreseen, at_end, foreseen
+from tactomo_models.methods.foreseen import Foreseen, at_end, foreseen, with_kind
 from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
 from tactomo_models.methods.rivals import (
     Rivals,
@@ -444,31 +444,39 @@ class Search:
         mine, now = dict(belief.rivals[k]), at_end(self.fit, account, frame)
         explains_little = account.chi_squared > SURPRISE * frame.likelihood.count
         for kind in kinds:
-            frame.budget.spend(account.fitted)  # about what foreseeing takes, too
-            found = foreseen(self.fit, self.field, account, k, kind, frame)
-            # Of two contacts in place of one that explains little the Jacobian foresees nothing.
-            is_far = kind is Kind.TWO and explains_little
-            if is_far:
-                found = found.begun
-            if is_far or found.log_evidence - now.log_evidence > HOPELESS:
-                found = self._checked(found, now, FAR_STEPS if is_far else STEPS, frame)
+            frame.budget.spend(account.fitted)  # about what asking takes, beside solves
+            if kind is Kind.TWO and explains_little:  # of which the Jacobian foresees nothing
+                each, own = with_kind(self.fit, self.field, account, k, kind)
+                start = self._account(each, account.fitted.log_ratio, frame)
+                found = self._checked(start, own, now, frame, FAR_STEPS, SURE_STEPS)
+            else:
+                found = foreseen(self.fit, self.field, account, k, kind, frame)
+                if found.log_evidence - now.log_evidence > HOPELESS:
+                    start = self._account(found.every, found.log_ratio, frame)
+                    found = self._checked(start, found.own, now, frame)
             log_odds = found.log_evidence - now.log_evidence
             mine[kind] = rival_of(found, log_odds, account.contacts[k], mine.get(kind))
         rivals = (*belief.rivals[:k], mine, *belief.rivals[k + 1 :])
         return replace(belief, rivals=rivals)
 
-    def _checked(self, found: Foreseen, now: Foreseen, steps: int, frame: Frame) -> Foreseen:
-        """What was foreseen, by solves from where it ends, as long as it is open."""
-        solved = self._account(found.every, found.log_ratio, frame)
-        found = at_end(self.fit, solved, frame, found.own)
+    def _checked(
+        self,
+        solved: Account,  # where to begin
+        own: IntArray,  # (m,) the contacts that were asked about
+        now: Foreseen,  # the end of the field as it is
+        frame: Frame,
+        steps: int = STEPS,  # no more than these
+        sure: int = 0,  # of them before what is foreseen to be hopeless is believed
+    ) -> Foreseen:
+        """What other contacts come to, by a fit that ends early where that is hopeless."""
+        found = at_end(self.fit, solved, frame, own)
         for taken in range(steps):
             is_hopeless = found.log_evidence - now.log_evidence < HOPELESS
-            is_sure = steps == STEPS or taken >= SURE_STEPS
             # A step that would lose is cut at a limit: the end is still far.
-            if 0 <= found.gain * solved.unit < FORESEEN or (is_hopeless and is_sure):
+            if 0 <= found.gain * solved.unit < FORESEEN or (is_hopeless and taken >= sure):
                 break
             solved = self._descended(solved, frame, 1)
-            found = at_end(self.fit, solved, frame, found.own)
+            found = at_end(self.fit, solved, frame, own)
         return found
 
     def _decided(self, belief: Belief, asked: Pass, frame: Frame) -> Belief | None:
