@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rich.text import Text
     from tactomo.cli.console import Console
 
-    from tactomo_lab.evaluation.stability import CaseScore, Trust
+    from tactomo_lab.evaluation.stability import Judged, Trust
     from tactomo_lab.scenes.measures import Score, Summary
 
 MAPS = ("frames", "ICC", "worst", "shape", "RIE", "flagged", "wrong", "ms", "p99")
@@ -286,12 +286,15 @@ def field(
 
     from tactomo_lab.commands.pictures import draw_press
     from tactomo_lab.evaluation.field import ROWS, STILL_ROWS, middle_press, scores_of_row
+    from tactomo_lab.evaluation.regimes import can_happen
     from tactomo_lab.scenes.measures import summarise
 
     description = load_description(sensor)
     scores: dict[str, list[Score]] = {}
-    known = ROWS if companion is None else STILL_ROWS
-    for row in chosen_names(rows, known, "--rows"):
+    chosen = chosen_names(rows, ROWS if companion is None else STILL_ROWS, "--rows")
+    if rows is None:
+        chosen = [row for row in chosen if can_happen(row, description)]
+    for row in chosen:
         total = count if row in STILL_ROWS else None
         lines_of = scores_of_row(description, row, method, seeds, count, companion)
         for line, frames in lines_of.items():
@@ -407,11 +410,13 @@ def stability(
     from tactomo_models import available_methods, load_description
 
     from tactomo_lab.commands.pictures import draw_overview
-    from tactomo_lab.evaluation.regimes import REGIMES
+    from tactomo_lab.evaluation.regimes import REGIMES, can_happen
     from tactomo_lab.evaluation.stability import evaluate_regimes, trust_by_regime
 
-    regimes = chosen_names(regime, REGIMES, "--regime")
     description = load_description(sensor)
+    regimes = chosen_names(regime, REGIMES, "--regime")
+    if regime is None:
+        regimes = [name for name in regimes if can_happen(name, description)]
     chosen = method or usable(description, available_methods())
     cases = evaluate_regimes(description, regimes, chosen, seeds, count, jobs=jobs)
     total = len(regimes) * count
@@ -438,7 +443,7 @@ def stability(
 
 
 def _print_regimes(
-    console: Console, rows: dict[str, dict[str, Trust]], scores: Sequence[CaseScore]
+    console: Console, rows: dict[str, dict[str, Trust]], scores: Sequence[Judged]
 ) -> None:
     fit = max(1, (console.width - NAME_WIDTH) // CELL_WIDTH)
     methods = list(rows["all"])
@@ -472,7 +477,7 @@ def _trust(counts: Trust) -> Text:
     return Text(f"{counts.icc:.2f} ").append_text(silent).append(good)
 
 
-def _doings(method: str, scores: Sequence[CaseScore]) -> Table:
+def _doings(method: str, scores: Sequence[Judged]) -> Table:
     """What one method did in each regime: tiers that made the maps, and flags."""
     from tactomo_lab.evaluation.regimes import REGIMES
 
@@ -480,8 +485,8 @@ def _doings(method: str, scores: Sequence[CaseScore]) -> Table:
     made = table(*columns, left=columns, title=f"what {method} did")
     for regime in dict.fromkeys(one.regime for one in scores):
         own = [one for one in scores if one.regime == regime]
-        tiers = Counter(one.tier for one in own)
-        flags = Counter(flag for one in own for flag in one.flags)
+        tiers = Counter(one.score.tier for one in own)
+        flags = Counter(flag for one in own for flag in one.score.flags)
         made.add_row(regime, REGIMES[regime].what, _tally(tiers), _tally(flags))
     return made
 

@@ -37,7 +37,7 @@ from tactomo_lab.scenes.case import (
     as_described,
     cached,
 )
-from tactomo_lab.scenes.drawing import SeedSet, require_both_channels, seed_of
+from tactomo_lab.scenes.drawing import SeedSet, require_channels, seed_of
 from tactomo_lab.scenes.simulation import (
     IMPEDANCE_DEVIATION,
     SHARP_M,
@@ -290,7 +290,7 @@ def simulate_day(
     description: SensorDescription, seed_set: SeedSet, number: int, hours: float = 24.0
 ) -> Day:
     """Draw a day and solve it; what was solved is kept."""
-    require_both_channels(description)
+    require_channels(description, *Channel)
     rng = np.random.default_rng(seed_of(seed_set, "drift", number))
     presses = draw_presses(description, hours, rng)
     step_at_s = float(rng.uniform(0.2, 0.8) * hours * 3600)

@@ -26,7 +26,7 @@ from tactomo_lab.evaluation.moving import (
 from tactomo_lab.evaluation.play import Outcome, play
 from tactomo_lab.evaluation.regimes import make_case
 from tactomo_lab.scenes.case import Case, with_companion
-from tactomo_lab.scenes.drawing import SeedSet, require_both_channels
+from tactomo_lab.scenes.drawing import SeedSet
 from tactomo_lab.scenes.measures import Score
 from tactomo_lab.scenes.still_scenes import SCENE_SHAPES, SceneShape, draw_still, still_case
 
@@ -64,7 +64,7 @@ def scores_of_row(
     relative error of a load cell under the sheet; None for none.
 
     Raises:
-        DataError: the sensor has a single channel, or no room for what presses.
+        DataError: the row cannot happen to the sensor, or has no room on it.
         ModelError: the method is not to be had for this sensor, or is the user's own and failed.
     """
     return {
@@ -89,9 +89,8 @@ def cases_of_row(
     `count` is of the scenes of each line, palms too; of other moving ones there is one for
     `SCENES_A_SEQUENCE`.
 
-    Raises DataError where the sensor has a single channel, or no room for what presses.
+    Raises DataError where the row cannot happen to the sensor, or has no room on it.
     """
-    require_both_channels(description)
     numbers = range(ceil(count / SCENES_A_SEQUENCE))
 
     def still(shapes: tuple[SceneShape, ...], snr_db: float) -> Iterator[Case]:

@@ -12,13 +12,15 @@ minutes, while the daemon's reference follows the skin.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
-from itertools import combinations
+from itertools import chain, combinations
 from typing import Final, Literal
 
 import numpy as np
 from tactomo_models.arrays import FloatArray
+from tactomo_models.errors import DataError
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scene.press import Press
 from tactomo_models.sensor.description import SensorDescription
@@ -47,9 +49,10 @@ from tactomo_lab.scenes.drawing import (
     BOTH_CHANNELS,
     GAP_M,
     SeedSet,
+    can_be_opposite,
     draw_contrast,
     gap_m,
-    require_both_channels,
+    is_inside,
     seed_of,
 )
 from tactomo_lab.scenes.measures import WRONG_ICC, Score, Summary, percentile, summarise
@@ -162,25 +165,59 @@ def draw_sequence(
 ) -> Case:
     """Draw and simulate the choreography: about a minute, or read from the cache.
 
-    Raises DataError where the sensor has a single channel.
+    Raises DataError where there is no room on the sensor.
     """
-    require_both_channels(description)
     rng = np.random.default_rng(seed_of(seed_set, "moving", number))
     contrast, opposite = draw_contrast(rng), bool(rng.integers(2))
-    quarters, mirrored = int(rng.integers(4)), bool(rng.integers(2))
-    millimetre_m = description.width_m / 150
-    steps = [
-        replace(step, presses={n: _turned(p, quarters, mirrored) for n, p in step.presses.items()})
-        for step in choreography(_draw_indenters(rng, millimetre_m), millimetre_m)
-    ]
+    steps = _draw_choreography(description, rng)
+    opposite = opposite and can_be_opposite(description)
     plan = Plan(_frames(steps), contrast, opposite, snr_db=snr_db, snr_of=snr_of)
     simulated = simulate(description, plan, seed_of(seed_set, "moving sheet", number))
     under_load = np.array([bool(step.presses) for step in steps])
     pressed = {name: scans[under_load] for name, scans in simulated.volts.pressed.items()}
     loaded = replace(simulated.volts, pressed=pressed)
-    noise = {name: noise_std(loaded, name, snr_db, snr_of) for name in BOTH_CHANNELS}
+    noise = {name: noise_std(loaded, name, snr_db, snr_of) for name in description.channels}
     seed = seed_of(seed_set, "moving noise", number)
     return follow(simulated, steps, noise, np.random.default_rng(seed), seed_set, number)
+
+
+def _draw_choreography(description: SensorDescription, rng: np.random.Generator) -> list[Step]:
+    """Draw the choreography across the sheet, or across the largest round room on it."""
+    quarters, mirrored = int(rng.integers(4)), bool(rng.integers(2))
+    again = deepcopy(rng)  # the same indenters, smaller
+
+    def across(width_m: float, rng: np.random.Generator) -> list[Step]:
+        millimetre_m = width_m / 150
+        steps = choreography(_draw_indenters(rng, millimetre_m), millimetre_m)
+        return [_changed(step, lambda press: _turned(press, quarters, mirrored)) for step in steps]
+
+    steps = across(description.width_m, rng)
+    if not _fits(description, steps):
+        width_m, x_m, y_m = _roomiest_place(description)
+
+        def moved(press: Press) -> Press:
+            return replace(press, x_m=press.x_m + x_m, y_m=press.y_m + y_m)
+
+        steps = [_changed(step, moved) for step in across(width_m, again)]
+        if not _fits(description, steps):
+            raise DataError(f"no room for the choreography on {description.name!r}")
+    return steps
+
+
+def _changed(step: Step, change: Callable[[Press], Press]) -> Step:
+    return replace(step, presses={name: change(press) for name, press in step.presses.items()})
+
+
+def _fits(description: SensorDescription, steps: Iterable[Step]) -> bool:
+    return all(is_inside(description, press) for press in set(chain(*_frames(steps))))
+
+
+def _roomiest_place(description: SensorDescription) -> tuple[float, float, float]:
+    """Diameter of the largest circle on the sheet, and its centre (x, y); to a map's node."""
+    x_m, y_m = np.meshgrid(description.map_x_m, description.map_y_m)
+    depth_m = description.sheet.outline.depth(x_m, y_m)
+    deepest = np.unravel_index(depth_m.argmax(), depth_m.shape)
+    return 2 * float(depth_m[deepest]), float(x_m[deepest]), float(y_m[deepest])
 
 
 def _frames(steps: Iterable[Step]) -> tuple[tuple[Press, ...], ...]:
@@ -230,18 +267,18 @@ def follow(
 
     def tare() -> Reference:
         if all(isinstance(std, float) for std in noise.values()):
-            rest = [
-                at_rest + noise[name] * rng.standard_normal((REFERENCE_SCANS, len(at_rest)))
+            rest = {
+                name: at_rest + noise[name] * rng.standard_normal((REFERENCE_SCANS, len(at_rest)))
                 for name, at_rest in volts.rest.items()
-            ]
-            return Reference.from_scans(*rest)
+            }
+            return Reference.from_scans(*map(rest.get, Channel))
         # One scan at rest, as `batch` takes it, does not tell the noise: the others do.
-        seen = [
-            scans + np.reshape(noise[name], (-1, 1)) * rng.standard_normal(scans.shape)
+        seen = {
+            name: scans + np.reshape(noise[name], (-1, 1)) * rng.standard_normal(scans.shape)
             for name, scans in volts.pressed.items()
-        ]
-        one = Reference(volts.rest[Channel.MAGNITUDE], volts.rest[Channel.STRUCTURE])
-        return one.with_noise_of(simulated.told, *seen)
+        }
+        one = Reference(volts.rest.get(Channel.MAGNITUDE), volts.rest.get(Channel.STRUCTURE))
+        return one.with_noise_of(simulated.told, *map(seen.get, Channel))
 
     first = tare()
     frames = []
@@ -283,16 +320,15 @@ def mixed_sequence(
     """Draw and simulate presses of mixed kinds that move: about 40 s, or read from the cache.
 
     Args:
-        description: the sensor; needs both channels.
+        description: the sensor.
         seed_set: which of the two sets of seeds.
         number: of the sequence; the presses are the same whatever the noise.
         noise_of: "each change": 40 dB under the change of each frame, and none at rest, of which
             there is one scan; "voltage": 60 dB under the voltages at rest.
 
     Raises:
-        DataError: the sensor has a single channel, or no room for what presses.
+        DataError: the sensor has no room for what presses.
     """
-    require_both_channels(description)
     draw = Draw(
         description, np.random.default_rng(seed_of(seed_set, "mixed-moving", number)), number
     )
@@ -301,7 +337,7 @@ def mixed_sequence(
     skin = seed_of(seed_set, "stability mixed-moving sheet", number)
     simulated = simulate(description, plan, skin)
     noise: dict[Channel, float | FloatArray] = {}
-    for name in BOTH_CHANNELS:
+    for name in description.channels:
         noise[name] = noise_std(simulated.volts, name, CONVERTER_DB, "voltage")
         if noise_of == "each change":
             change = simulated.volts.pressed[name] - simulated.volts.rest[name]
@@ -315,15 +351,17 @@ def mixed_sequence(
 def palm_sequence(description: SensorDescription, seed_set: SeedSet, number: int) -> Case:
     """Draw and simulate a palm that comes, a case of that regime: 7 s, or read from the cache.
 
-    Raises DataError where the sensor has a single channel.
+    Raises DataError where the sensor has no room for a palm.
     """
-    require_both_channels(description)
     plan = draw_plan(description, "palm", seed_set, number)
     simulated = simulate(description, plan, seed_of(seed_set, "stability palm sheet", number))
     steps = [_palm_step(presses) for presses in plan.frames]
     rng = np.random.default_rng(seed_of(seed_set, "palm seconds", number))
     period_s = float(np.exp(rng.uniform(*np.log(PALM_S)))) / PALM_FRAMES
-    noise = {n: noise_std(simulated.volts, n, plan.snr_db, plan.snr_of) for n in BOTH_CHANNELS}
+    noise = {
+        name: noise_std(simulated.volts, name, plan.snr_db, plan.snr_of)
+        for name in description.channels
+    }
     seed = seed_of(seed_set, "palm noise", number)
     return follow(simulated, steps, noise, np.random.default_rng(seed), seed_set, number, period_s)
 

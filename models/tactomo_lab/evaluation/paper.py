@@ -42,7 +42,7 @@ from tactomo_lab.scenes.case import (
     simulate,
 )
 from tactomo_lab.scenes.case import Frame as CaseFrame
-from tactomo_lab.scenes.drawing import BOTH_CHANNELS, SeedSet, require_both_channels, seed_of
+from tactomo_lab.scenes.drawing import BOTH_CHANNELS, SeedSet, require_channels, seed_of
 from tactomo_lab.scenes.measures import Summary, correlation, full_range, summarise
 from tactomo_lab.scenes.presets import PAPER_CONTACTS, PAPER_CONTRAST, paper_presses
 from tactomo_lab.scenes.simulation import Truth, Volts
@@ -92,7 +92,7 @@ def paper_scenes(
 
     Raises DataError where the sensor has a single channel, or no room for that many contacts.
     """
-    require_both_channels(description)
+    require_channels(description, *Channel)
     assert description.magnitude is not None
     opposite = description.magnitude.response.sign > 0  # the paper's conductivity falls
     for contact_count in contacts:
@@ -221,7 +221,7 @@ class Rig:
         *,
         snr_db: float = RIG_SNR_DB,
     ) -> None:
-        require_both_channels(description)
+        require_channels(description, *Channel)
         self.description = description
         self.sheet = sheet
         self._seed_set = seed_set

@@ -33,16 +33,15 @@ from tactomo_lab.scenes.case import (
     with_noise,
 )
 from tactomo_lab.scenes.drawing import (
-    BOTH_CHANNELS,
     PRESSURE_KPA,
     Placed,
     SeedSet,
+    can_be_opposite,
     draw_contrast,
     draw_indenter,
     gap_m,
     is_inside,
     placed_apart,
-    require_both_channels,
     scale_of,
     seed_of,
 )
@@ -83,7 +82,7 @@ class Draw:
         return Plan(
             frames=tuple(tuple(presses) for presses in frames),
             contrast=draw_contrast(self.rng),
-            opposite=bool(self.rng.integers(2)),
+            opposite=bool(self.rng.integers(2)) and can_be_opposite(self.description),
         )
 
     def scene(self, pressure_kpa: Range = PRESSURE_KPA) -> tuple[Press, ...]:
@@ -190,8 +189,9 @@ class Draw:
         return int(self.rng.integers(self.description.electrode_count))
 
     def sheet(self) -> tuple[Channel, ...]:
-        """One of the two."""
-        return (BOTH_CHANNELS[self.rng.integers(2)],)
+        """One of the sensor's."""
+        channels = self.description.channels
+        return (channels[self.rng.integers(len(channels))],)
 
     def in_turn(self, *kinds: float) -> float:
         """The kind that is this case's."""
@@ -200,26 +200,42 @@ class Draw:
 
 @dataclass(frozen=True)
 class Regime:
-    """One thing that goes wrong; `sensor_of` makes its cases' sensor of the one evaluated."""
+    """One thing that goes wrong."""
 
     what: str
     draw: Callable[[Draw], Plan]
-    sensor_of: SensorOf
+    sensor_of: SensorOf  # makes its cases' sensor of the one evaluated
+    can_happen: Callable[[SensorDescription], bool]  # whether it can go wrong with a sensor
 
 
 REGIMES: Final[dict[str, Regime]] = {}
 
 
 def regime(
-    name: str, what: str, sensor_of: SensorOf = lambda sensor: sensor
+    name: str,
+    what: str,
+    sensor_of: SensorOf = lambda sensor: sensor,
+    can_happen: Callable[[SensorDescription], bool] = lambda _: True,
 ) -> Callable[[Callable[[Draw], Plan]], Callable[[Draw], Plan]]:
     """Let a function draw the cases of a regime."""
 
     def add(draw: Callable[[Draw], Plan]) -> Callable[[Draw], Plan]:
-        REGIMES[name] = Regime(what, draw, sensor_of)
+        REGIMES[name] = Regime(what, draw, sensor_of, can_happen)
         return draw
 
     return add
+
+
+def _has_two_sheets(description: SensorDescription) -> bool:
+    return len(description.channels) > 1
+
+
+def _has_magnitude(description: SensorDescription) -> bool:
+    return description.magnitude is not None
+
+
+def _has_structure(description: SensorDescription) -> bool:
+    return description.structure is not None
 
 
 @regime("ordinary", "Nothing goes wrong: what the others compare with.")
@@ -344,7 +360,11 @@ def by_hand_as_told(draw: Draw, *frames: Sequence[Press]) -> Plan:
     return replace(plan, snr_db=CONVERTER_DB, snr_of="voltage")
 
 
-@regime("overload", "One to three presses, the first or all beyond the response table's end.")
+@regime(
+    "overload",
+    "One to three presses, the first or all beyond the response table's end.",
+    can_happen=_has_magnitude,
+)
 def _overload(draw: Draw) -> Plan:
     assert draw.description.magnitude is not None
     end_kpa = draw.description.magnitude.response.pressure_kpa[-1]
@@ -404,12 +424,16 @@ def _graded(draw: Draw) -> Plan:
     return replace(plan, opposite=False)  # conductivity cannot fall by more than all of it
 
 
-@regime("wrong-contrast", "A contrast of 3 or 1000 where 100 was told.")
+@regime("wrong-contrast", "A contrast of 3 or 1000 where 100 was told.", can_happen=_has_structure)
 def _wrong_contrast(draw: Draw) -> Plan:
     return replace(draw.plan(draw.scene()), contrast=draw.in_turn(3, 1000))
 
 
-@regime("wrong-sign", "The magnitude channel changes against the sign told.")
+@regime(
+    "wrong-sign",
+    "The magnitude channel changes against the sign told.",
+    can_happen=can_be_opposite,
+)
 def _wrong_sign(draw: Draw) -> Plan:
     return replace(draw.plan(draw.scene()), sign_told=False)
 
@@ -478,7 +502,11 @@ def _stretched(draw: Draw) -> Plan:
     return replace(draw.plan(draw.scene()), stretch=draw.rng.uniform(0.02, 0.05))
 
 
-@regime("one-scan-apart", "A sliding contact, the structure scan one behind.")
+@regime(
+    "one-scan-apart",
+    "A sliding contact, the structure scan one behind.",
+    can_happen=_has_two_sheets,
+)
 def _behind(draw: Draw) -> Plan:
     return replace(draw.plan(*draw.slide((4, 10))), behind=1)
 
@@ -495,9 +523,18 @@ def _wrong_regularisation(draw: Draw) -> Plan:
     return replace(draw.plan(draw.scene()), regularisation=draw.in_turn(0.01, 100))
 
 
-@regime("lost-scans", "A sliding contact, its last 1 to 3 structure scans lost.")
+@regime(
+    "lost-scans",
+    "A sliding contact, its last 1 to 3 structure scans lost.",
+    can_happen=_has_two_sheets,
+)
 def _lost_scans(draw: Draw) -> Plan:
     return replace(draw.plan(*draw.slide((3, 8))), lost=int(draw.in_turn(1, 2, 3)))
+
+
+def can_happen(name: str, description: SensorDescription) -> bool:
+    """Whether what goes wrong in a regime can go wrong with a sensor; every other row can."""
+    return name not in REGIMES or REGIMES[name].can_happen(description)
 
 
 def draw_plan(description: SensorDescription, regime: str, seed_set: SeedSet, number: int) -> Plan:
@@ -521,9 +558,13 @@ def make_case(
 
     Its noise is the plan's, or that of a ratio of the change.
 
-    Raises DataError where the sensor has a single channel, or no room for what presses.
+    Raises DataError where the regime cannot happen to the sensor, or has no room on it.
     """
-    require_both_channels(description)
+    if not can_happen(regime, description):
+        raise DataError(
+            f"{regime!r} cannot happen to {description.name!r}, which has "
+            f"{' and '.join(description.channels)}: choose other regimes"
+        )
     description = REGIMES[regime].sensor_of(description)
     plan = draw_plan(description, regime, seed_set, number)
     skin, noise = (

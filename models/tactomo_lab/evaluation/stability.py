@@ -11,84 +11,53 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from tactomo_models.physics.artifact import load_or_build_artifact
-from tactomo_models.scans.plausibility import DISTRUST
 from tactomo_models.sensor.description import SensorDescription
 
 from tactomo_lab.evaluation.play import Player, Variant
 from tactomo_lab.evaluation.regimes import make_case
 from tactomo_lab.evaluation.trade_off import left_out
 from tactomo_lab.scenes.case import Case
-from tactomo_lab.scenes.drawing import SeedSet, require_both_channels
-from tactomo_lab.scenes.measures import BAD_ICC, correlation, mean
+from tactomo_lab.scenes.drawing import SeedSet
+from tactomo_lab.scenes.measures import BAD_ICC, Score, mean, score
 
 
-@dataclass(frozen=True)
-class CaseScore:
-    """How one case came out."""
+class Judged(NamedTuple):
+    """A method's score on the last frame of a regime's case."""
 
-    # regime, case, method: which
     regime: str
-    case: str
     method: str
-    # contacts, found: how many press, and were reported
-    contacts: int
-    found: int
-    # of the magnitude map; of the pressed shape where nothing presses hard enough to show in it;
-    # where nothing presses at all, 1 if nothing was reported and else 0
-    icc: float
-    warned: bool  # whether a flag of `DISTRUST`, or the lack of a map, told not to trust it
-    flags: tuple[str, ...]  # names of all that were raised
-    # tier, reason, misfit, confidence: as reported
-    tier: str
-    reason: str
-    misfit: float
-    confidence: float
+    score: Score
 
     @property
-    def bad(self) -> bool:
-        """Whether the map shows something else than what presses."""
-        return self.icc < BAD_ICC
+    def is_bad(self) -> bool:
+        """Whether what is shown is something else than what presses."""
+        return self.score.likeness < BAD_ICC
 
     def as_json(self) -> dict[str, Any]:
         """All of it as numbers and names."""
-        return {**asdict(self), "bad": self.bad}
+        return {
+            "regime": self.regime,
+            "method": self.method,
+            "bad": self.is_bad,
+            **self.score.as_json(),
+        }
 
 
-def judge(regime: str, case: Case, methods: Iterable[str]) -> list[CaseScore]:
+def judge(regime: str, case: Case, methods: Iterable[str]) -> list[Judged]:
     """Reconstruct a case by one method after the other; the last frame is judged.
 
     Raises ModelError where a method's network is not there.
     """
-    player, truth = Player(case.description), case.truth
+    player = Player(case.description)
     found = []
     for method in methods:
         *_, last = player.play(case, Variant(method))
-        made = last.made
-        shown, true = made.map, truth.map
-        if not truth.map.any():
-            shown, true = made.structure, truth.pressed
-        is_pressed = bool(truth.pressed.any())
-        found.append(
-            CaseScore(
-                regime=regime,
-                case=f"{case.seed_set} {case.number}",
-                method=method,
-                contacts=len(truth.contacts),
-                found=len(made.contacts),
-                icc=correlation(shown, true) if is_pressed else float(not made.contacts),
-                warned=bool(made.flags & DISTRUST) or shown is None,
-                flags=tuple(made.flags.names()),
-                tier=made.tier,
-                reason=made.reason,
-                misfit=made.misfit,
-                confidence=made.confidence,
-            )
-        )
+        found.append(Judged(regime, method, score(case, last.frame, last.made, last.seconds, {})))
     return found
 
 
@@ -100,16 +69,15 @@ def evaluate_regimes(
     count: int,
     *,
     jobs: int = 1,
-) -> Iterator[list[CaseScore]]:
+) -> Iterator[list[Judged]]:
     """Reconstruct cases of some regimes by some methods.
 
     Yields:
         Each case's scores, of the methods that its sensor has; in the order of regimes and
         numbers whatever `jobs`.
 
-    Raises DataError where the sensor has a single channel, or no room for what presses.
+    Raises DataError where a regime cannot happen to the sensor, or has no room on it.
     """
-    require_both_channels(description)
     load_or_build_artifact(description)  # built once, by this process
     work = partial(_evaluate_case, description, tuple(methods), seed_set)
     which = [(regime, number) for regime in regimes for number in range(count)]
@@ -126,7 +94,7 @@ def _evaluate_case(
     methods: tuple[str, ...],
     seed_set: SeedSet,
     which: tuple[str, int],
-) -> list[CaseScore]:
+) -> list[Judged]:
     case = make_case(description, which[0], seed_set, which[1])
     missing = left_out(case.description, methods)  # a regime may have a sensor of its own
     return judge(which[0], case, (method for method in methods if method not in missing))
@@ -145,14 +113,14 @@ class Trust:
     good_flagged: int  # good maps with any flag
 
 
-def trust(scores: Iterable[CaseScore]) -> Trust:
+def trust(judged: Iterable[Judged]) -> Trust:
     """Count bad maps and warnings."""
-    known = list(scores)
-    bad = [score for score in known if score.bad]
-    good = [score for score in known if not score.bad]
+    known = list(judged)
+    bad = [one.score for one in known if one.is_bad]
+    good = [one.score for one in known if not one.is_bad]
     return Trust(
         maps=len(known),
-        icc=mean(score.icc for score in known),
+        icc=mean(one.score.likeness for one in known),
         bad=len(bad),
         bad_unwarned=sum(not score.warned for score in bad),
         bad_unflagged=sum(not (score.warned or score.flags) for score in bad),
@@ -161,14 +129,14 @@ def trust(scores: Iterable[CaseScore]) -> Trust:
     )
 
 
-def trust_by_regime(scores: Iterable[CaseScore]) -> dict[str, dict[str, Trust]]:
+def trust_by_regime(judged: Iterable[Judged]) -> dict[str, dict[str, Trust]]:
     """Counts of every regime, and of all of them under "all", by method."""
-    known = list(scores)
-    methods = dict.fromkeys(score.method for score in known)
+    known = list(judged)
+    methods = dict.fromkeys(one.method for one in known)
 
-    def by_method(chosen: list[CaseScore]) -> dict[str, Trust]:
-        return {m: trust(score for score in chosen if score.method == m) for m in methods}
+    def by_method(chosen: list[Judged]) -> dict[str, Trust]:
+        return {m: trust(one for one in chosen if one.method == m) for m in methods}
 
-    regimes = dict.fromkeys(score.regime for score in known)
-    rows = {r: by_method([score for score in known if score.regime == r]) for r in regimes}
+    regimes = dict.fromkeys(one.regime for one in known)
+    rows = {r: by_method([one for one in known if one.regime == r]) for r in regimes}
     return {**rows, "all": by_method(known)}

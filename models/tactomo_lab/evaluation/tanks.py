@@ -31,7 +31,7 @@ from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.sensor.description import SensorDescription
 
 from tactomo_lab.evaluation.measured_sets import read_set
-from tactomo_lab.scenes import measures
+from tactomo_lab.scenes.measures import correlation
 from tactomo_lab.tanks.fit import TankFit
 from tactomo_lab.tanks.images import pixel_grid, probabilities, signed_image
 from tactomo_lab.tanks.model import Readings, TankModel
@@ -205,9 +205,3 @@ def on_pixels(description: SensorDescription, nodes: Image, shape: tuple[int, ..
     grid = (description.map_y_m, description.map_x_m)
     image = RegularGridInterpolator(grid, nodes)((radius_m * y, radius_m * x))
     return np.where(inside, image, np.nan)
-
-
-def correlation(image: FloatArray, truth: FloatArray) -> float:
-    """Pearson correlation over the pixels where the image is known; 0 for an even image."""
-    on = np.isfinite(image)
-    return measures.correlation(image[on], truth[on])

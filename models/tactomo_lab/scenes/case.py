@@ -322,7 +322,7 @@ def measure(
         plan,
         _regularised(simulated.told, plan.regularisation),
         simulated.true,
-        Reference.from_scans(rest[Channel.MAGNITUDE], rest.get(Channel.STRUCTURE)),
+        Reference.from_scans(*map(rest.get, Channel)),
         frames,
     )
 

@@ -39,13 +39,21 @@ def seed_of(seed_set: str, purpose: str, *numbers: int) -> np.random.SeedSequenc
     return np.random.SeedSequence([int.from_bytes(name), *numbers])
 
 
-def require_both_channels(description: SensorDescription) -> None:
-    """Refuse a sensor that has a single channel, by a DataError."""
-    if len(description.channels) < 2:
-        raise DataError(
-            f"sensor {description.name!r} has one channel; scenes need a magnitude and a "
-            "structure channel: choose another description"
-        )
+def require_channels(description: SensorDescription, *channels: Channel) -> None:
+    """Refuse a sensor that lacks one of these channels, by a DataError."""
+    for channel in channels:
+        if channel not in description.channels:
+            raise DataError(
+                f"sensor {description.name!r} has no {channel} channel, which is needed here: "
+                "choose another description"
+            )
+
+
+def can_be_opposite(description: SensorDescription) -> bool:
+    """Whether the magnitude channel could change by as much the other way: by less than all."""
+    if description.magnitude is None:
+        return False
+    return max(map(abs, description.magnitude.response.relative_change)) < 1
 
 
 def scale_of(description: SensorDescription) -> float:

@@ -40,17 +40,22 @@ BAND_KPA = 10.0  # pressures that count as one where errors at one pressure are 
 
 
 def correlation(image: NDArray[Any] | None, truth: FloatArray) -> float:
-    """ICC of an image with the truth; 0 where there is no image, or one without contrast."""
-    if image is None or not np.ptp(image) > 0 or not np.ptp(truth) > 0:
+    """ICC of an image with the truth, where the image is known; 0 without an image or contrast."""
+    if image is None:
         return 0.0
-    return float(np.corrcoef(image.ravel(), truth.ravel())[0, 1])
+    on = np.isfinite(image)
+    shown, true = image[on], truth[on]
+    if not shown.size or not np.ptp(shown) > 0 or not np.ptp(true) > 0:
+        return 0.0
+    return float(np.corrcoef(shown, true)[0, 1])
 
 
 def relative_error(image: NDArray[Any] | None, truth: FloatArray) -> float:
     """RIE of an image; 1 where there is none: as of an empty one."""
     if image is None:
         return 1.0
-    return float(np.linalg.norm(image - truth) / np.linalg.norm(truth))
+    on = np.isfinite(image)
+    return float(np.linalg.norm(image[on] - truth[on]) / np.linalg.norm(truth))
 
 
 def match(found: Sequence[Contact], true: Sequence[TrueContact]) -> list[tuple[int, int]]:
@@ -147,8 +152,12 @@ class Score:
     flags: tuple[str, ...]  #: names of what was flagged
     distrusted: bool  #: whether a flag told the user not to trust the frame
     wrong: bool  #: whether it shows something else than what presses
+    has_map: bool  #: whether any was made
     tier: str  #: what made it
-    misfit: float  #: as reported
+    #: reason, misfit, confidence: as reported
+    reason: str
+    misfit: float
+    confidence: float
     seconds: float  #: that it took
     #: shape, contrast, opposite, snr_db: of the case
     shape: str
@@ -169,14 +178,30 @@ class Score:
         return self.icc < BAD_ICC
 
     @property
+    def likeness(self) -> float:
+        """Its ICC where presses show in the map; else that of the pressed shape.
+
+        Where nothing presses, 1 if nothing was reported, else 0.
+        """
+        if not self.groups:
+            return float(not self.found)
+        known = [icc for icc in (self.icc, self.icc_structure) if np.isfinite(icc)]
+        return known[0] if known else 0.0
+
+    @property
+    def warned(self) -> bool:
+        """Whether a flag of `DISTRUST`, or the lack of a map, told not to trust it."""
+        return not self.has_map or not set(self.flags).isdisjoint(DISTRUST.names())
+
+    @property
     def confidently_wrong(self) -> bool:
         """Whether it shows something else than what presses, and no flag says so."""
         return not self.distrusted and (self.wrong or self.count_right is False)
 
     def as_json(self) -> dict[str, Any]:
         """All of it as numbers and names."""
-        derived = {"count_right": self.count_right, "confidently_wrong": self.confidently_wrong}
-        return {**asdict(self), **derived}
+        derived = ("count_right", "confidently_wrong", "likeness", "warned")
+        return {**asdict(self), **{name: getattr(self, name) for name in derived}}
 
 
 def score(
@@ -192,8 +217,11 @@ def score(
     groups = touching(frame.presses)
     contacts = dict(zip(frame.presses, truth.contacts, strict=True))
     alone = {group[0]: contacts[group[0]] for group in groups if len(group) == 1}
-    rie, icc = _likeness(made.map, truth.map, bool(lost))
-    _, icc_structure = _likeness(made.structure, truth.pressed, bool(lost))
+    of_map = _likeness(made.map, truth.map, bool(lost))
+    has_structure = case.description.structure is not None
+    of_shape = _likeness(made.structure, truth.pressed, bool(lost) or not has_structure)
+    # Without a magnitude channel the shape is the map.
+    (rie, icc), (_, icc_structure) = of_map if case.description.magnitude else of_shape, of_shape
     return Score(
         scene=case.name,
         phase=frame.phase,
@@ -209,8 +237,11 @@ def score(
         distrusted=bool(made.flags & NOT_WHOLE),
         # Of a moving scene the shape counts, too: it is all that shows of a light touch.
         wrong=icc < WRONG_ICC or (not case.is_still and icc_structure < WRONG_ICC),
+        has_map=made.map is not None or made.structure is not None,
         tier=made.tier,
+        reason=made.reason,
         misfit=made.misfit,
+        confidence=made.confidence,
         seconds=seconds,
         shape=case.shape,
         contrast=case.plan.contrast,
@@ -268,13 +299,12 @@ def score_contact(
 ) -> ContactScore:
     """Compare a contact with the true one that it is taken for; None where there is none."""
     curve = described_curve(description)
-    assert curve is not None
     known = ContactScore(
         shape=true.shape,
         area_mm2=true.area_m2 * 1e6,
         pressure_kpa=true.pressure_kpa,
         magnitude=true.magnitude,
-        beyond=true.pressure_kpa > curve.range_kpa[1],
+        beyond=curve is not None and true.pressure_kpa > curve.range_kpa[1],
     )
     if found is None:
         return known
@@ -307,8 +337,9 @@ def _sigmas(error: float, sigma: float) -> float:
 
 
 def full_range(description: SensorDescription) -> float:
-    """Size of the relative change at the end of the sensor's measuring range."""
-    assert description.magnitude is not None
+    """Size of the relative change at the end of the measuring range; NaN where there is none."""
+    if description.magnitude is None:
+        return float("nan")
     return float(np.abs(description.magnitude.response.change(np.array(FULL_RANGE_KPA))))
 
 

@@ -18,7 +18,13 @@ from tactomo_models.scene.press import Press, Profile, Shape
 from tactomo_models.scene.pressure import PressureCurve
 from tactomo_models.sensor.description import SensorDescription
 
-from tactomo_lab.scenes.drawing import draw_contrast, placed_apart, scale_of, seed_of
+from tactomo_lab.scenes.drawing import (
+    can_be_opposite,
+    draw_contrast,
+    placed_apart,
+    scale_of,
+    seed_of,
+)
 
 PresetName = Literal["paper", "robust"]
 SCENES: Final[dict[PresetName, int]] = {"paper": 12_000, "robust": 24_000}  # of a whole set
@@ -126,7 +132,7 @@ def _robust(description: SensorDescription, seed: int, number: int) -> TrainingS
     """None to ten contacts of any form and pressure, on sheets as uneven as real ones."""
     rng = np.random.default_rng(seed_of("training", "robust", seed, number))
     skin = np.random.default_rng(seed_of("training", "robust skin", seed, number // SAME_SKIN))
-    opposite = bool(skin.integers(2))
+    opposite = bool(skin.integers(2)) and can_be_opposite(description)
     sheets = (_sheet_errors(description, skin), _sheet_errors(description, skin))
     count = int(rng.choice(len(ROBUST_CONTACTS), p=ROBUST_CONTACTS))
     gap = scale_of(description) * ROBUST_GAP_M

@@ -237,19 +237,17 @@ class Truth:
 
 
 def truth_of(description: SensorDescription, presses: Sequence[Press]) -> Truth:
-    """What a map of these presses should be; needs the sensor's magnitude channel."""
-    assert description.magnitude is not None
-    response = description.magnitude.response
+    """What a map of these presses should be; zeros where there is no magnitude channel."""
     along_x, step_x = _cell_samples(description.map_x_m)
     along_y, step_y = _cell_samples(description.map_y_m)
     x, y = np.meshgrid(along_x, along_y)
     edge_m = max(step_x, step_y)
     pressure, coverage = strongest(presses, x, y, edge_m)
-    magnitude = coverage * np.abs(response.change(pressure))
+    magnitude = coverage * np.abs(_change(description, pressure))
     contacts = []
     for press in presses:
         own = press.coverage(x, y, edge_m)
-        change = np.broadcast_to(response.change(np.asarray(press.pressure_at(x, y))), x.shape)
+        change = _change(description, np.broadcast_to(press.pressure_at(x, y), x.shape))
         contacts.append(
             TrueContact(
                 x_m=press.x_m,
@@ -266,6 +264,13 @@ def truth_of(description: SensorDescription, presses: Sequence[Press]) -> Truth:
         contacts=tuple(contacts),
         force_n=1e3 * float((coverage * pressure).sum()) * step_x * step_y,
     )
+
+
+def _change(description: SensorDescription, pressure_kpa: FloatArray) -> FloatArray:
+    """Relative change of the magnitude channel at a pressure; 0 without one; same shape."""
+    if description.magnitude is None:
+        return np.zeros_like(pressure_kpa)
+    return description.magnitude.response.change(pressure_kpa)
 
 
 def _saturation(description: SensorDescription, pressure_kpa: FloatArray) -> FloatArray:

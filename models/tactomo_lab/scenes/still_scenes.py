@@ -19,10 +19,10 @@ from tactomo_lab.scenes.drawing import (
     GAP_M,
     SHAPES,
     SeedSet,
+    can_be_opposite,
     draw_contrast,
     draw_indenter,
     placed_apart,
-    require_both_channels,
     seed_of,
 )
 
@@ -34,7 +34,7 @@ TRIES = 30  # of a contact, before all are drawn anew
 
 
 def scenes(
-    description: SensorDescription,  # the sensor; needs both channels
+    description: SensorDescription,  # the sensor
     # "tuning" for whoever chooses a constant by what comes out, "reporting" for figures that are
     # published
     seed_set: SeedSet,
@@ -46,9 +46,8 @@ def scenes(
 ) -> Iterator[Case]:
     """Scenes of a seed set, `count` of each number of contacts; the same ones every time.
 
-    Raises DataError where the sensor has a single channel, or no room for that many contacts.
+    Raises DataError where the sensor has no room for that many contacts.
     """
-    require_both_channels(description)
     for contact_count in contacts:
         for number in range(count):
             plan = draw_still(description, seed_set, contact_count, number)
@@ -84,6 +83,7 @@ def draw_still(
     rng = np.random.default_rng(seed_of(seed_set, "layout", contacts, number))
     shape = SCENE_SHAPES[rng.integers(4 if contacts > 1 else 3)]
     contrast, opposite = draw_contrast(rng), bool(rng.integers(2))
+    opposite = opposite and can_be_opposite(description)
 
     def one() -> Press:
         return draw_indenter(

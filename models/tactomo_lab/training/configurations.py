@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, cast
 
@@ -106,6 +106,8 @@ def prepare(
     torch.manual_seed(seed)
     scale = full_range(description)
     if configuration.kind == "network":
+        there = tuple(name for name in configuration.channels if name in description.channels)
+        configuration = replace(configuration, channels=there)
         forward = ForwardModel(description, load_or_build_artifact(description).bare)
         batches = SceneBatches(folder, description, configuration.channels, forward)
         network = FusionNetwork(batches.inputs, batches.nodes, configuration.width, scale)

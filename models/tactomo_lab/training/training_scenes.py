@@ -36,7 +36,7 @@ from tactomo_models.simulation.simulator import conductivity_ratio, smooth_noise
 from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
-from tactomo_lab.scenes.drawing import require_both_channels
+from tactomo_lab.scenes.drawing import require_channels
 from tactomo_lab.scenes.presets import (
     PresetName,
     SheetErrors,
@@ -102,11 +102,11 @@ class SceneSimulator:
     """Simulates training scenes of one sensor.
 
     Raises:
-        DataError: it has one channel.
+        DataError: it has no magnitude channel.
     """
 
     def __init__(self, description: SensorDescription) -> None:
-        require_both_channels(description)
+        require_channels(description, Channel.MAGNITUDE)
         self.description = description
         # Scenes in a row may have the same sheets.
         self._sheets: dict[Channel, tuple[int | None, _Sheet]] = {}
@@ -124,7 +124,9 @@ class SceneSimulator:
             volts, single precision; `map` and `pressed` (nodes_y, nodes_x), see `Truth`, half
             precision; `contacts`, how many; `opposite`.
         """
-        sensor = with_contrast(self.description, scene.contrast)
+        sensor = self.description
+        if sensor.structure is not None:
+            sensor = with_contrast(sensor, scene.contrast)
         if scene.opposite:
             sensor = with_opposite_magnitude(sensor)
         made: dict[str, Any] = {}
@@ -237,12 +239,14 @@ def simulate(
 
     Raises:
         ModelError: the folder holds another set, a file cannot be written, or a process fails.
-        DataError: the sensor has one channel, or no room for the contacts.
+        DataError: the sensor lacks a channel that the preset needs, or room for the contacts.
         ModuleNotFoundError: joblib is not installed; it comes with tactomo-lab[train].
     """
     import joblib  # noqa: F401 - before anything is written
 
     SceneSimulator(description)  # refuses a sensor it cannot serve before anything is written
+    if preset == "paper":
+        require_channels(description, *Channel)
     write_manifest(folder, _manifest(description, preset, seed, scenes))
     make = partial(simulate_shard, description, preset, seed)
     yield from make_shards(folder, SCENES, shards_of(scenes), make, jobs=jobs)

@@ -64,12 +64,6 @@ def test_what_it_cannot_read_is_a_usage_error(tactomo: Run, option: str, value: 
     assert f"{value!r}: give" in result.stderr
 
 
-def test_a_sensor_of_one_channel_cannot_be_evaluated_so(tactomo: Run) -> None:
-    result = tactomo("evaluate", "scenes", "--description", "tank_disc")
-    assert result.returncode == 1
-    assert "one channel" in result.stderr
-
-
 @pytest.mark.long
 def test_moving_scenes(tactomo: Run, tmp_path: Path) -> None:
     """On a coarse map, so that a sequence is simulated in seconds."""

@@ -50,7 +50,7 @@ def test_in_numbers_words_and_pictures(stability: Run, tmp_path: Path) -> None:
                 if one["method"] == method and regime in (one["regime"], "all")
             ]
             assert counts["maps"] == len(own)
-            assert counts["bad"] == sum(one["icc"] < 0.7 for one in own)
+            assert counts["bad"] == sum(one["likeness"] < 0.7 for one in own)
     assert picture.read_bytes().startswith(b"\x89PNG")
     words = stability(*some)
     assert words.returncode == 0
@@ -73,9 +73,3 @@ def test_what_it_does_not_know_is_a_usage_error(
     result = stability(option, value)
     assert result.returncode == 2
     assert why in result.stderr
-
-
-def test_a_sensor_of_one_channel_cannot_be_evaluated_so(tactomo: Run) -> None:
-    result = tactomo("evaluate", "stability", "--description", "tank_disc", "--method", "tikhonov")
-    assert result.returncode == 1
-    assert "one channel" in result.stderr

@@ -26,7 +26,7 @@ from tactomo_lab.scenes.simulation import (
     with_opposite_magnitude,
 )
 from tactomo_lab.scenes.still_scenes import draw_still, scenes
-from tactomo_models import DataError, Press, SensorDescription, load_description
+from tactomo_models import DataError, Press, SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.bare_sheet import transfer_resistances
 from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
@@ -228,11 +228,6 @@ def test_what_the_cache_cannot_keep_is_simulated(
     kept = one(paper)
     monkeypatch.setenv("CACHE_DIRECTORY", "/proc/nowhere")
     np.testing.assert_array_equal(scan_of(one(paper)), scan_of(kept))
-
-
-def test_a_sensor_of_one_channel_has_no_scenes() -> None:
-    with pytest.raises(DataError, match="one channel"):
-        next(scenes(load_description("tank_disc"), "tuning", 1))
 
 
 def test_more_contacts_than_there_is_room_for(small: SensorDescription) -> None:

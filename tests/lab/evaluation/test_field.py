@@ -17,9 +17,8 @@ from tactomo_lab.evaluation.moving import NOISE_DB, draw_sequence, mixed_sequenc
 from tactomo_lab.evaluation.regimes import make_case
 from tactomo_lab.scenes.case import Case
 from tactomo_lab.scenes.measures import summarise
-from tactomo_models import DataError, SensorDescription
+from tactomo_models import SensorDescription
 from tactomo_protocol import Channel
-from variants import variant
 
 
 def one_of(small: SensorDescription, row: str) -> dict[str, Case]:
@@ -116,8 +115,3 @@ def test_mixed_moving_presses_are_scored_at_both_noises(small: SensorDescription
     for noise_of, scores in zip(NOISE_DB, lines.values(), strict=True):
         frames = len(mixed_sequence(small, "tuning", 0, noise_of).frames)
         assert summarise(list(scores)).frames == frames
-
-
-def test_a_sensor_of_one_channel_has_no_rows(small: SensorDescription) -> None:
-    with pytest.raises(DataError, match="one channel"):
-        cases_of_row(variant(small, magnitude=None), "soft", "tuning", 1)

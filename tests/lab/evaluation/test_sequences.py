@@ -19,9 +19,8 @@ from tactomo_lab.evaluation.play import play
 from tactomo_lab.evaluation.regimes import KINDS, PALM_FRAMES, Draw
 from tactomo_lab.scenes.case import Case, Frame
 from tactomo_lab.scenes.drawing import BOTH_CHANNELS, GAP_M, gap_m, outline_of
-from tactomo_models import DataError, Press, SensorDescription
+from tactomo_models import Press, SensorDescription
 from tactomo_models.arrays import FloatArray
-from variants import variant
 
 
 @pytest.fixture(scope="module")
@@ -131,8 +130,3 @@ def test_a_palm_is_followed_while_the_reference_is(small: SensorDescription) -> 
     counted = list(scores)
     assert len(counted) == len(palm)
     assert {score.count_right for score in counted} <= {True, False}
-
-
-def test_a_sensor_of_one_channel_has_no_sequences(small: SensorDescription) -> None:
-    with pytest.raises(DataError, match="one channel"):
-        mixed_sequence(variant(small, magnitude=None), "tuning", 0, "voltage")

@@ -12,12 +12,12 @@ from simulated_tanks import simulated_tanks
 from tactomo_lab.evaluation.tanks import (
     TankImager,
     Tanks,
-    correlation,
     evaluate_tanks,
     expected_correlation,
     on_pixels,
     read_tanks,
 )
+from tactomo_lab.scenes.measures import correlation
 from tactomo_models import (
     Artifact,
     DataError,

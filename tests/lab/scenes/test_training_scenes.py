@@ -127,8 +127,8 @@ def test_another_sensor_gets_scenes_of_its_own_size(
     assert 190 < max(flat) <= 200  # where its table ends
 
 
-def test_a_sensor_of_one_channel_is_refused() -> None:
-    with pytest.raises(DataError, match=r"tank_disc.* has one channel.*another description"):
+def test_a_sensor_without_a_magnitude_channel_is_refused() -> None:
+    with pytest.raises(DataError, match=r"tank_disc.* has no magnitude channel.*another"):
         SceneSimulator(load_description("tank_disc"))
 
 

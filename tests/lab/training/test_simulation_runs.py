@@ -143,8 +143,8 @@ def test_a_set_that_is_not_complete_is_not_read(folder: Path, tmp_path: Path) ->
         read_scenes(folder)
 
 
-def test_a_sensor_of_one_channel_leaves_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="has one channel"):
+def test_a_sensor_without_a_magnitude_channel_leaves_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="has no magnitude channel"):
         list(simulate(load_description("tank_disc"), "robust", tmp_path / "new", SCENES))
     assert not (tmp_path / "new").exists()
 
@@ -229,5 +229,5 @@ class TestCommand:
     def test_errors_are_told_without_a_traceback(self, tactomo: Run, small_file: Path) -> None:
         one = tactomo("models", "simulate", "scenes", "--description", "tank_disc")
         assert one.returncode == 1
-        assert one.stderr.startswith("tactomo: sensor 'tank_disc' has one channel")
+        assert one.stderr.startswith("tactomo: sensor 'tank_disc' has no magnitude channel")
         assert tactomo("models", "simulate", "scenes", "--scenes", 0).returncode == 2
