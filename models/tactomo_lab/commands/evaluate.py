@@ -344,24 +344,23 @@ def drift(
     kelvin, a tenth of it unevenly; what is pressed creeps by 1 % per decade of time and comes back
     as slowly; contact impedances wander by 10 %. Presses last from seconds to two hours, a third
     of them too light for the magnitude channel. A frame comes every 20 s, and two a second while
-    something is pressed or let go; every tenth of the former without tracking.
-
-    The first run simulates (some minutes a day) and keeps the voltages in the cache.
+    something is pressed or let go; every tenth of the former without tracking. The skin is the
+    twin's. A day takes some minutes.
     """
     from tactomo_models import load_description
 
-    from tactomo_lab.commands.pictures import draw_day
-    from tactomo_lab.evaluation.drifting import live, simulate_day, summarise_day
+    from tactomo_lab.commands.pictures import draw_day as draw_picture
+    from tactomo_lab.evaluation.drifting import draw_day, live, summarise_day
 
     description = load_description(sensor)
     days, found, rows = [], {}, []
     for number in range(count):
-        day = simulate_day(description, seeds, number, hours)
+        day = draw_day(description, seeds, number, hours)
         name = f"{seeds} {number}"
         seen = {}
         for way, every in (("tracked", 1), ("untracked", FEWER)):
             frames = live(day, track=way == "tracked", every=every)
-            total = sum(1 for _ in day.times(every))
+            total = len(day.times_s(every))
             seen[way] = list(shown(frames, total, f"{name}, {way}"))
             found[f"{name}, {way}"] = summarise_day(seen[way], hours)
         days.append((day, seen))
@@ -372,7 +371,7 @@ def drift(
         as_json,
         lambda console: print_suite(console, what, {"days": DAYS}, found),
         picture,
-        lambda output: draw_day(days[0][0], days[0][1], output),
+        lambda output: draw_picture(days[0][0], days[0][1], output),
     )
 
 

@@ -161,7 +161,7 @@ def draw_day(day: Day, seen: dict[str, list[Seen]], output: Path) -> None:
     figure = Figure(figsize=(11, 6.5), layout="constrained")
     axes: Any = figure.subplots(3, 1, sharex=True, height_ratios=(2, 2, 1.6))
     hours = np.array([each.time_s / 3600 for each in tracked])
-    true = [100 * math.expm1(-day.skin.warming(each.time_s)) for each in tracked]
+    true = [100 * math.expm1(-day.drift(each.time_s).warming(each.time_s)) for each in tracked]
     axes[0].plot(hours, true, color="0.6", lw=4, label="of the sheet, by temperature")
     axes[0].plot(hours, [100 * e.gain for e in tracked], lw=1.2, label="followed")
     axes[0].set_ylabel("voltages since\nthe tare (%)")
@@ -175,7 +175,7 @@ def draw_day(day: Day, seen: dict[str, list[Seen]], output: Path) -> None:
     axes[1].plot([e.time_s / 3600 for e in late], bare, "x", ms=4, label="untracked")
     axes[1].set_ylabel("|Δσ|/σ₀ of\nfirm presses")
     axes[1].legend(frameon=False, ncols=3)
-    for each in day.skin.presses:
+    for each in day.presses:
         for axis in axes:
             axis.axvspan(each.start_s / 3600, each.end_s / 3600, color="0.93", lw=0)
     for label, frames in seen.items():

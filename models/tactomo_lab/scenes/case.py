@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache, partial
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from tactomo_models.archive import read_arrays, write_whole
@@ -212,34 +212,22 @@ def _warped(mesh: SheetMesh, plan: Plan, sensor: SensorDescription) -> SheetMesh
 
 
 def _kept(what: str, make: Callable[[], SimulatedVolts]) -> SimulatedVolts:
-    """Voltages from an earlier call, or simulated and kept."""
-
-    def arrays() -> dict[str, FloatArray]:
-        volts = make()
-        rest = {f"{name}_rest": scan for name, scan in volts.rest.items()}
-        return rest | {f"{name}_pressed": scans for name, scans in volts.pressed.items()}
-
-    kept = cached(what, arrays)
-    channels = [name for name in BOTH_CHANNELS if f"{name}_rest" in kept]
-    return SimulatedVolts(
-        rest={name: kept[f"{name}_rest"] for name in channels},
-        pressed={name: kept[f"{name}_pressed"] for name in channels},
-    )
-
-
-def cached(what: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """Arrays from an earlier call, or made anew and kept in the user's cache.
+    """Voltages from an earlier call, or simulated and kept in the user's cache.
 
     `what` has all that they depend on. A file that cannot be read or written costs time and nothing
     else.
     """
     path = cache_folder() / "scenes" / f"{hashlib.sha256(what.encode()).hexdigest()[:32]}.npz"
+    parts = ("rest", "pressed")
     with suppress(OSError, DataError):
-        return read_arrays(path)
-    arrays = make()
+        kept = read_arrays(path)
+        channels = [name for name in BOTH_CHANNELS if f"{name}_rest" in kept]
+        return SimulatedVolts(*({n: kept[f"{n}_{part}"] for n in channels} for part in parts))
+    volts = make()
+    arrays = {f"{n}_{part}": v for part in parts for n, v in getattr(volts, part).items()}
     with suppress(OSError):
         write_whole(path, lambda file: np.savez(file, **arrays))
-    return arrays
+    return volts
 
 
 def with_companion(case: Case, relative_error: float) -> Case:

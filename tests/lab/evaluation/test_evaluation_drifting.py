@@ -7,8 +7,8 @@ import pytest
 from tactomo_lab.evaluation.drifting import (
     Seen,
     TimedPress,
+    draw_day,
     live,
-    simulate_day,
     summarise_day,
 )
 from tactomo_models import Artifact, SensorDescription
@@ -23,11 +23,9 @@ def _built(artifact: Artifact, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_an_hour_of_drift_leaves_no_ghost_and_erases_nothing(paper: SensorDescription) -> None:
-    day = simulate_day(paper, "tuning", 3, hours=0.75)
-    again = simulate_day(paper, "tuning", 3, hours=0.75)
-    np.testing.assert_array_equal(
-        day.stretches[-1].volts[Channel.STRUCTURE], again.stretches[-1].volts[Channel.STRUCTURE]
-    )
+    day = draw_day(paper, "tuning", 3, hours=0.75)
+    first, again = (day.case(track=False).frames[-1].scans[Channel.STRUCTURE] for _ in range(2))
+    np.testing.assert_array_equal(first, again)
     tracked = summarise_day(list(live(day)), day.hours)
     assert tracked.presses == 3
     assert tracked.ghost_share == tracked.erased == tracked.missed == 0
@@ -37,8 +35,8 @@ def test_an_hour_of_drift_leaves_no_ghost_and_erases_nothing(paper: SensorDescri
 @pytest.mark.long
 @pytest.mark.timeout(7200)
 def test_a_day_of_drift_leaves_no_ghost_and_erases_nothing(paper: SensorDescription) -> None:
-    """Ten minutes, most of which it simulates."""
-    day = simulate_day(paper, "tuning", 0)
+    """Some minutes."""
+    day = draw_day(paper, "tuning", 0)
     tracked = summarise_day(list(live(day)), day.hours)
     assert tracked.missed == tracked.erased == 0
     assert tracked.ghosts_per_hour == 0
