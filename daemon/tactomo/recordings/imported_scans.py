@@ -37,7 +37,6 @@ from tactomo_models import Reference, SensorDescription
 from tactomo_models.archive import read_arrays
 from tactomo_models.arrays import FloatArray
 from tactomo_models.batch import all_nan, checked, scans_of
-from tactomo_models.scans.plausibility import Layout
 from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
 from tactomo_models.sensor.pattern import rim_signs, touching
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
@@ -269,30 +268,17 @@ def _batch(path: Path, arrays: dict[str, NDArray[Any]], description: SensorDescr
     return Scans(volts, _times(path, arrays, len(next(iter(volts.values())))), reference)
 
 
-def single_ended(
-    path: Path, arrays: dict[str, NDArray[Any]], layout: Layout
-) -> tuple[FloatArray, FloatArray | None, tuple[str, ...]]:
-    """Return single-ended readings as differences (T, M), their times, and notes for people.
-
-    Raises:
-        ImportFileError: they do not fit the sensor, or are of no one phase.
-    """
-    raw, time_s = _differences(path, arrays, layout)
-    volts, notes, _ = _in_phase(path, raw, None)
-    return volts, time_s, notes
-
-
 def _differences(
-    path: Path, arrays: dict[str, NDArray[Any]], layout: Layout
+    path: Path, arrays: dict[str, NDArray[Any]], description: SensorDescription
 ) -> tuple[NDArray[Any], FloatArray | None]:
-    injection, raw = _single_ended_arrays(path, arrays, layout)
-    rows, signs = _injection_rows(path, injection - injection.min(), layout)
-    plus, minus = layout.pairs.measure.T
+    injection, raw = _single_ended_arrays(path, arrays, description)
+    rows, signs = _injection_rows(path, injection - injection.min(), description)
+    plus, minus = description.pairs.measure.T
     differences = signs * (raw[:, rows, plus] - raw[:, rows, minus])
     return differences, _times(path, arrays, len(raw))
 
 
-def phase_rad(volts: NDArray[Any]) -> float:
+def _phase_rad(volts: NDArray[Any]) -> float:
     """Return the phase that complex volts of either sign have in common, within half a turn."""
     return float(np.angle(np.nansum(volts**2))) / 2
 
@@ -305,7 +291,7 @@ def _in_phase(
         return raw.astype(np.float64), (), None
     notes: tuple[str, ...] = ()
     if turn_rad is None:
-        turn_rad = -phase_rad(raw) if _quadrature(raw) > MAX_QUADRATURE else 0.0
+        turn_rad = -_phase_rad(raw) if _quadrature(raw) > MAX_QUADRATURE else 0.0
     if turn_rad:
         notes = (f"turned by {np.degrees(turn_rad):.0f} degrees, into phase with the current",)
         raw = raw * np.exp(1j * turn_rad)
@@ -399,10 +385,10 @@ def _unlike(
 
 
 def _single_ended_arrays(
-    path: Path, arrays: dict[str, NDArray[Any]], layout: Layout
+    path: Path, arrays: dict[str, NDArray[Any]], description: SensorDescription
 ) -> tuple[NDArray[np.int_], NDArray[Any]]:
     injection = _checked(path, "injection", arrays["injection"], (None, 2)).astype(int)
-    raw, electrodes = arrays["volts"], layout.electrode_count
+    raw, electrodes = arrays["volts"], description.electrode_count
     fits = raw.shape[1:] == (len(injection), electrodes) and raw.size > 0
     if not fits or raw.dtype.kind not in "fciu":
         raise ImportFileError(
@@ -413,12 +399,12 @@ def _single_ended_arrays(
 
 
 def _injection_rows(
-    path: Path, injection: NDArray[np.int_], layout: Layout
+    path: Path, injection: NDArray[np.int_], description: SensorDescription
 ) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
     """Return, for each voltage, its row in the file and the sign of the current there."""
     where = {(sink, source): (row, -1) for row, (source, sink) in enumerate(injection.tolist())}
     where |= {(source, sink): (row, 1) for row, (source, sink) in enumerate(injection.tolist())}
-    wanted = [tuple(pair) for pair in layout.pairs.drive.tolist()]
+    wanted = [tuple(pair) for pair in description.pairs.drive.tolist()]
     missing = sorted(set(wanted) - where.keys())
     if missing:
         raise ImportFileError(

@@ -82,7 +82,7 @@ def pattern_of_zeros(scans: FloatArray) -> PatternLayout:
 
     A device that reports all L measuring pairs for each of L drives has 0 where a measuring pair
     touches a driven electrode: that happens at m - k in {0, drive offset, minus measuring offset,
-    their difference}, which tells both offsets. `without_zeros` leaves them out.
+    their difference}, which tells both offsets.
 
     Raises:
         DataError: the number of voltages is no square, or the zeros do not fit just one pattern.
@@ -91,7 +91,7 @@ def pattern_of_zeros(scans: FloatArray) -> PatternLayout:
     if count * count != scans.shape[1]:
         raise DataError(
             f"scans of {scans.shape[1]} voltages are not every drive by every measuring pair; "
-            "give --description, or a lookup of electrodes"
+            "give --description or --pattern"
         )
     zero = (scans == 0).all(axis=0).reshape(count, count)
     always = [n for n in range(count) if np.all(zero[range(count), (np.arange(count) + n) % count])]
@@ -103,12 +103,6 @@ def pattern_of_zeros(scans: FloatArray) -> PatternLayout:
     if len(fits) != 1:
         raise DataError(
             f"the zeros of these {count} x {count} voltages fit {len(fits)} patterns of drive and "
-            "measuring pairs; give --description, or a lookup of electrodes"
+            "measuring pairs; give --description or --pattern"
         )
     return PatternLayout(scan_pairs(count, *fits[0]), count)
-
-
-def without_zeros(layout: PatternLayout, scans: FloatArray) -> FloatArray:
-    """Return the scans (T, M) without the measuring pairs that touch a driven electrode."""
-    position = layout.pairs.drive[:, 0] * layout.electrode_count + layout.pairs.measure[:, 0]
-    return np.asarray(scans[:, position])

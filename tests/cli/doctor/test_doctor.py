@@ -19,6 +19,7 @@ from tactomo_models import SensorDescription, load_description, load_or_build_ar
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.bare_sheet import scan_voltages
 from tactomo_models.sensor.description_file import shipped_text
+from tactomo_models.sensor.named_pattern import NamedPattern
 from tactomo_models.sensor.pattern import reciprocal_pairs, scan_pairs
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
 from waiting import PATIENCE_S, wait_until
@@ -109,7 +110,7 @@ def test_an_unknown_device_is_read_by_its_zeros(tactomo: Run, rest: FloatArray) 
     np.savez("in.npz", baseline=every_pair(16, np.abs(noisy(rest))), dv=np.zeros((3, 256)))
     outcome = tactomo("doctor", "in.npz", "--json")
     assert outcome.returncode == 0, outcome.stdout
-    assert "by the zeros, drive k to k+1, measure m to m+1" in " ".join(report(outcome)["notes"])
+    assert "read as 16:adjacent" in " ".join(report(outcome)["notes"])
 
 
 def test_voltages_in_no_order_are_a_broken_device(tactomo: Run, rest: FloatArray) -> None:
@@ -120,20 +121,22 @@ def test_voltages_in_no_order_are_a_broken_device(tactomo: Run, rest: FloatArray
     assert "broken: nothing" in outcome.stdout
 
 
-def test_a_lookup_says_the_order(tactomo: Run, rest: FloatArray, paper: SensorDescription) -> None:
-    order = np.random.default_rng(0).permutation(208)
-    table = np.hstack([paper.pairs.drive, paper.pairs.measure])[order]
-    np.savez("in.npz", empty=noisy(rest)[:, order], how=table)
-    outcome = tactomo("doctor", "in.npz", "--lookup", "how", "--json")
-    assert outcome.returncode == 0, outcome.stdout
-    assert about(report(outcome)["channels"]["empty"]["findings"], "reciprocity")["level"] == "ok"
+def test_a_pattern_says_the_order(tactomo: Run, rest: FloatArray) -> None:
+    rotated = NamedPattern.of_name("16:adjacent:rotated")
+    np.savez("in.npz", empty=noisy(rest)[:, np.argsort(rotated.order)])
+    for more in ([], ["--pattern", str(rotated)]):
+        outcome = tactomo("doctor", "in.npz", *more, "--json")
+        assert outcome.returncode == 0, outcome.stdout
+        assert f"read as {rotated}" in " ".join(report(outcome)["notes"])
+        (found,) = report(outcome)["channels"].values()
+        assert about(found["findings"], "reciprocity")["level"] == "ok"
 
 
 def test_complex_scans_are_turned(tactomo: Run, rest: FloatArray) -> None:
     np.savez("in.npz", reference=noisy(rest) * np.exp(0.5j), frames_=np.zeros(1))
     outcome = tactomo("doctor", "in.npz", "--frames", "0:10", "--json")
     assert outcome.returncode == 0, outcome.stdout
-    assert "turned by -29 degrees; 0% is out of phase" in " ".join(report(outcome)["notes"])
+    assert "turned by -29 degrees" in " ".join(report(outcome)["notes"])
 
 
 @pytest.mark.parametrize(
@@ -141,9 +144,10 @@ def test_complex_scans_are_turned(tactomo: Run, rest: FloatArray) -> None:
     [
         ({"dv": (5, 208)}, [], "holds changes of voltages"),
         ({"other": (5, 208)}, [], "name the array of scans at rest with --array"),
-        ({"rest": (5, 7)}, [], "give --description, or a lookup"),
-        ({"rest": (5, 256)}, [], "fit 0 patterns"),
-        ({"rest": (5, 208), "lookup": (4, 4)}, [], "source, sink, v+, v-"),
+        ({"rest": (5, 7)}, [], "give --description or --pattern"),
+        ({"rest": (5, 256)}, [], "256 voltages a scan, which fit no pattern"),
+        ({"rest": (5, 208)}, ["--array", "mine"], "there is no array 'mine'"),
+        ({"rest": (5, 208)}, ["--pattern", "16:round"], "'16:round' is no pattern"),
         ({"rest": (5, 208)}, ["--frames", "7:9"], "give other --frames"),
     ],
 )

@@ -76,9 +76,10 @@ def doctor(
     array: Annotated[
         str | None, typer.Option(help="Array of an .npz file with scans at rest.")
     ] = None,
-    lookup: Annotated[
-        str, typer.Option(help="Array of an .npz file with the order of voltages.")
-    ] = "lookup",
+    pattern: Annotated[
+        str | None,
+        typer.Option(help="Of what a file's numbers are: 16:adjacent. [the one that fits]"),
+    ] = None,
     as_json: options.JsonOutput = False,
     keys: options.KeysFolder = None,
 ) -> None:
@@ -94,11 +95,10 @@ def doctor(
     others, or jumps), *misread* (breaks laws that any sheet obeys: a break, a short), *swapped*
     (two leads changed places; needs a description).
 
-    An .npz file is read as what `tactomo import` takes. Otherwise `--array` names scans at rest,
-    (T, voltages), or one called baseline, reference, rest or empty is taken. Its order: an array
-    `lookup` (voltages, 4) of source, sink, v+, v-, counted from 0; or the description's; or, of
-    L (L - 3) voltages, adjacent pairs; or, of L x L, every drive by every measuring pair, the
-    pattern known by where the zeros are. How it was read is part of the report.
+    A file is read as `tactomo reconstruct` reads it; `--array` names scans at rest, (T, voltages),
+    or one called reference, baseline, rest, empty or vh is taken. Without a description the order
+    is `--pattern`, or the one that fits: by where the zeros are, of every drive by every measuring
+    pair; else by reciprocity. How the file was read is part of the report.
     """
     from tactomo_client.keys import as_keys
     from tactomo_models.health.findings import worst
@@ -120,7 +120,7 @@ def doctor(
                 lambda passed_s: line_shown.update(words.format(passed_s, seconds)),
             )
         else:
-            evidence = _of_file(what, description, chosen, array, lookup)
+            evidence = _of_file(what, description, chosen, array, pattern)
         channels = _diagnose(evidence)
     line = stream_findings(evidence)
     levels = [diagnosis.level for diagnosis in channels.values()]
@@ -134,7 +134,11 @@ def doctor(
 
 
 def _of_file(
-    what: Path, description: str | None, frames: slice | None, array: str | None, lookup: str
+    what: Path,
+    description: str | None,
+    frames: slice | None,
+    array: str | None,
+    pattern: str | None,
 ) -> Evidence:
     from tactomo_models.array_files import READERS
 
@@ -149,7 +153,7 @@ def _of_file(
         warn_of_damage(recording)
         return of_recording(recording, description, frames)
     if suffix in (".npz", *READERS):
-        return of_arrays(what, description, array, lookup, frames)
+        return of_arrays(what, description, array, pattern, frames)
     raise DoctorError(f"{what} is neither .mcap nor .npz", "give a recording, scans, or no file")
 
 

@@ -16,17 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from tactomo_client import Keys
 from tactomo_client.schema import STALE_AFTER_S
-from tactomo_models import DescriptionError, SensorDescription, load_description
+from tactomo_models import DescriptionError, load_description
 from tactomo_models.array_files import NUMBERS
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scans.plausibility import Layout
-from tactomo_models.sensor.pattern import (
-    Pairs,
-    PatternLayout,
-    pattern_of_zeros,
-    scan_pairs,
-    without_zeros,
-)
+from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
+from tactomo_models.sensor.pattern import PatternLayout, scan_pairs
 from tactomo_protocol import SCAN_COUNTERS, Channel, Hello, Scan, ScanFlag
 
 from tactomo.errors import TactomoError
@@ -34,13 +29,12 @@ from tactomo.recordings.imported_scans import (
     AT_REST,
     is_single_ended,
     load_arrays,
-    phase_rad,
     read_scans,
-    single_ended,
 )
 from tactomo.recordings.recording import Recording
 
 CHANGES = "dv"
+ANY_RING = "tank_disc"  # stands for a sheet that nobody has described, while its file is read
 
 
 class DoctorError(TactomoError):
@@ -352,139 +346,87 @@ def of_arrays(
     description: str | None,
     # name of the array of scans at rest, where the layout is neither of import's
     array: str | None,
-    lookup: str,  # name of the array that says which electrodes each voltage is of
+    pattern: str | None,  # the order of its voltages; the description's, or what fits, if None
     frames: slice | None,  # which scans; all if None
 ) -> Evidence:
-    """Read an .npz file; see `tactomo doctor --help` for the layouts.
+    """Read a file of arrays as `tactomo reconstruct` does; see `tactomo doctor --help`.
 
     Raises:
         DoctorError: it holds nothing that can be examined.
-        ImportFileError: it cannot be read.
+        ImportFileError, EitFileError: it cannot be read, or does not fit the description.
         DataError: the scans fit no pattern.
     """
-    known = None if description is None else load_description(description)
     arrays = load_arrays(path)
-    if array is None and is_single_ended(arrays):
-        evidence = _single_ended_evidence(path, arrays, known)
-    elif array is None and arrays.keys() & {"magnitude", "structure"}:
-        evidence = _batch_evidence(path, known or load_description("paper_square"))
+    is_batch = array is None and bool(arrays.keys() & set(Channel))
+    if array is None and not (is_batch or is_single_ended(arrays)):
+        array = _at_rest(path, arrays)
+    named = None if pattern is None else NamedPattern.of_name(pattern)
+    layout: Layout
+    names: tuple[str, ...]
+    if description is not None or is_batch:
+        sensor = load_description(description or "paper_square")
+        layout = sensor = sensor if named is None else named.applied(sensor)
+        names, how = sensor.channels, f"read as scans of {sensor.name}"
     else:
-        return _plain_evidence(path, arrays, known, array, lookup, frames)
-    if frames is not None:
-        evidence.scans = {n: _cut(path, scans, frames) for n, scans in evidence.scans.items()}
-        times_s = evidence.times_s.items()
-        evidence.times_s = {n: None if t is None else t[frames] for n, t in times_s}
-    return evidence
+        named = named or _fitting_pattern(path, arrays, array)
+        sensor, layout = named.applied(load_description(ANY_RING)), named.layout
+        names, how = (array or "volts",), f"read as {named}; no description of the sheet"
+    read = read_scans(path, sensor, sensor.channels[-1], array=array, pattern=named)
+    scans: dict[str, FloatArray] = {}
+    times_s: dict[str, FloatArray | None] = {}
+    for channel, volts in read.volts.items():
+        name = channel if channel in names else names[0]
+        scans[name], times_s[name] = volts, read.time_s
+        if frames is not None:
+            scans[name] = _cut(path, volts, frames)
+            times_s[name] = None if read.time_s is None else read.time_s[frames]
+    return Evidence(str(path), layout, scans, times_s, notes=(how, *read.notes))
 
 
-def _cut(path: Path, scans: NDArray[Any], frames: slice) -> NDArray[Any]:
+def _cut(path: Path, scans: FloatArray, frames: slice) -> FloatArray:
     if not len(scans[frames]):
         raise DoctorError(f"{path} has {len(scans)} scans, none of these", "give other --frames")
     return scans[frames]
 
 
-def _batch_evidence(path: Path, description: SensorDescription) -> Evidence:
-    read = read_scans(path, description, None)
-    scans = {str(channel): volts for channel, volts in read.volts.items()}
-    return Evidence(
-        str(path),
-        description,
-        scans,
-        dict.fromkeys(scans, read.time_s),
-        notes=(f"read as scans of {description.name}", *read.notes),
-    )
-
-
-def _single_ended_evidence(
-    path: Path, arrays: dict[str, NDArray[Any]], description: SensorDescription | None
-) -> Evidence:
-    layout: Layout = description or _pattern_of_injection(arrays)
-    volts, time_s, notes = single_ended(path, arrays, layout)
-    name = "volts" if description is None else description.channels[-1]
-    note = "adjacent measurement; no description of the sheet" if description is None else ""
-    return Evidence(
-        str(path),
-        layout,
-        {name: volts},
-        {name: time_s},
-        notes=tuple(each for each in (*notes, note) if each),
-    )
-
-
-def _pattern_of_injection(arrays: dict[str, NDArray[Any]]) -> PatternLayout:
-    injection, electrodes = arrays["injection"].astype(int), arrays["volts"].shape[-1]
-    offsets = (injection[:, 1] - injection[:, 0]) % electrodes
-    offset = int(np.median(np.minimum(offsets, electrodes - offsets)))
-    return PatternLayout(scan_pairs(electrodes, max(1, offset)), electrodes)
-
-
-def _plain_evidence(
-    path: Path,
-    arrays: dict[str, NDArray[Any]],
-    description: SensorDescription | None,
-    name: str | None,
-    lookup: str,
-    frames: slice | None,
-) -> Evidence:
-    name = name or next((known for known in (*AT_REST, NUMBERS) if known in arrays), None)
-    if name is None and CHANGES in arrays:
+def _at_rest(path: Path, arrays: Mapping[str, NDArray[Any]]) -> str:
+    """Name the array of scans of the unpressed sheet."""
+    name = next((known for known in (*AT_REST, NUMBERS) if known in arrays), None)
+    if name is not None:
+        return name
+    if CHANGES in arrays:
         raise DoctorError(
             f"{path} holds changes of voltages ({CHANGES}) and no scans at rest: noise and "
             "reciprocity belong to voltages",
             "name an array of scans of the unpressed sheet with --array",
         )
-    if name is None or name not in arrays:
-        held = ", ".join(arrays) or "nothing"
-        raise DoctorError(f"{path} holds {held}", "name the array of scans at rest with --array")
-    raw = arrays[name] if arrays[name].ndim > 1 else arrays[name][None]
+    held = ", ".join(arrays) or "nothing"
+    raise DoctorError(f"{path} holds {held}", "name the array of scans at rest with --array")
+
+
+def _fitting_pattern(
+    path: Path, arrays: Mapping[str, NDArray[Any]], array: str | None
+) -> NamedPattern:
+    """Work out the pattern of scans whose sheet nobody has described."""
+    if array is None:  # of single-ended readings, by where the current went
+        injection, electrodes = arrays["injection"].astype(int), arrays["volts"].shape[-1]
+        offsets = (injection[:, 1] - injection[:, 0]) % electrodes
+        offset = int(np.median(np.minimum(offsets, electrodes - offsets)))
+        return NamedPattern(electrodes, max(1, offset), 1)
+    if array not in arrays:
+        raise DoctorError(f"{path} holds {', '.join(arrays)}", f"there is no array {array!r}")
+    raw = np.atleast_2d(arrays[array])
     if raw.ndim != 2 or raw.dtype.kind not in "fiuc" or raw.size == 0:
         raise DoctorError(
-            f"{path}: {name} is {raw.dtype} {raw.shape}", "it must be numbers, (T, voltages)"
+            f"{path}: {array} is {raw.dtype} {raw.shape}", "it must be numbers, (T, voltages)"
         )
-    scans, note = _real(raw if frames is None else _cut(path, raw, frames))
-    layout, scans, order = _ordered(arrays, scans, description, lookup)
-    notes = (f"scans at rest: {name} {raw.shape}", order, *note)
-    return Evidence(str(path), layout, {name: scans}, {name: None}, notes=notes)
-
-
-def _real(raw: NDArray[Any]) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return complex scans turned by one angle, so that they are as real as can be."""
-    if raw.dtype.kind != "c":
-        return raw.astype(np.float64), ()
-    angle = phase_rad(raw)
-    turned = raw * np.exp(-1j * angle)
-    left = float(np.linalg.norm(turned.imag) / np.linalg.norm(turned))
-    note = f"turned by {np.degrees(-angle):.0f} degrees; {left:.0%} is out of phase and left out"
-    return np.asarray(turned.real, dtype=np.float64), (note,)
-
-
-def _ordered(
-    arrays: dict[str, NDArray[Any]],
-    scans: FloatArray,
-    description: SensorDescription | None,
-    lookup: str,
-) -> tuple[Layout, FloatArray, str]:
-    """Return which electrodes each voltage is of, the scans so, and how that is known."""
-    count = scans.shape[1]
-    if lookup in arrays:
-        table = arrays[lookup].astype(np.intp)
-        if table.shape != (count, 4):
-            raise DoctorError(
-                f"{lookup} is {table.shape} for {count} voltages",
-                "it must be (voltages, 4): source, sink, v+, v-, counted from 0",
-            )
-        pairs = Pairs(table[:, :2], table[:, 2:])
-        return PatternLayout(pairs, int(table.max()) + 1), scans, f"in the order of {lookup}"
-    if description is not None:
-        return description, scans, f"in the order of {description.name}"
+    count = raw.shape[1]
     electrodes = round((3 + np.sqrt(9 + 4 * count)) / 2)
-    if electrodes * (electrodes - 3) == count:
-        note = f"{electrodes} electrodes, adjacent pairs, those that touch the drive left out"
-        return PatternLayout(scan_pairs(electrodes), electrodes), scans, note
-    layout = pattern_of_zeros(scans)
-    drive, measure = layout.pairs.drive[0], layout.pairs.measure[0]
-    note = (
-        f"{layout.electrode_count} drives by {layout.electrode_count} measuring pairs; by the "
-        f"zeros, drive k to k+{drive[1] - drive[0]}, measure m to m+{measure[1] - measure[0]}"
-    )
-    return layout, without_zeros(layout, scans), note
+    adjacent = [NamedPattern(electrodes, 1, 1)] * (electrodes * (electrodes - 3) == count)
+    found = [*fitting_patterns(np.abs(raw) if raw.dtype.kind == "c" else raw), *adjacent]
+    if not found:
+        raise DoctorError(
+            f"{path}: {array} has {count} voltages a scan, which fit no pattern",
+            "give --description or --pattern, such as 16:opposite:adjacent",
+        )
+    return found[0]
