@@ -61,7 +61,8 @@ def run(fit: FieldFit) -> None:
         for k in range(len(each)):
             others = empty.of(np.delete(each, k, axis=0)).with_free(slice(PEAK, HOLE))
             fewer = others.draw(others.join(others.fixed))
-            assert all(np.isfinite(one).all() for one in fit.step_to(fitted, fewer, data))
+            [step] = fit.steps_to(fitted, [fewer], data)
+            assert all(np.isfinite(one).all() for one in vars(step).values())
     level_set = LevelSet(fit.forward)
     likeness = np.clip(1 - np.hypot(empty.x_m, empty.y_m) / 0.016, 0, 1)
     fitted = fit.evaluate(level_set, level_set.parameters_of(likeness), fit.likely, data)

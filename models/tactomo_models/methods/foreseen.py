@@ -4,7 +4,7 @@ Voltages go by the conductivity of nodes. From the field as it was solved, other
 of conductivities; the residual there and its derivative follow to first order, and one step of
 Newton, within the limits of the parameters, leads to the end that a fit would come to:
 
-    r(p) = r_0 + J_nodes s(p)      s: see `FieldFit.step_to`
+    r(p) = r_0 + J_nodes s(p)      s: see `FieldFit.steps_to`
 
 The evidence of that end is compared with the evidence of the field. Of a field that is solved the
 same step says what is left to gain.
@@ -12,6 +12,7 @@ same step says what is left to gain.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,13 +21,13 @@ from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.methods.account import Account, Frame, laplace
 from tactomo_models.methods.kinds import Kind, as_kind
 from tactomo_models.scene.drawing import Drawing
-from tactomo_models.scene.field_fit import FieldFit
+from tactomo_models.scene.field_fit import FieldFit, Step
 from tactomo_models.scene.parameters import PEAK
 from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import GradedResponse
 
 BELOW = 1 - 1e-9  # of the onset: a peak there leaves no trace, and the table has no slope
-PEAKS = 64  # between the onset and the largest peak, that are compared with a contact's change
+PEAKS = 16  # between the onset and the largest peak, that are compared with a contact's change
 MAX_LIMITED = 4  # times that parameters are held at their limits, before what is left is taken
 
 
@@ -53,32 +54,63 @@ class Foreseen:
 
 
 def foreseen(
-    fit: FieldFit, field: PressureField, account: Account, k: int, kind: Kind, frame: Frame
-) -> Foreseen:
-    """What a fit would come to with one contact of another kind.
+    fit: FieldFit,
+    field: PressureField,
+    account: Account,
+    k: int,
+    kinds: Sequence[Kind],
+    frame: Frame,
+) -> list[Foreseen]:
+    """What a fit would come to with one contact of another kind, for each such kind.
 
     Args:
         fit: what fits fields to the sheets.
         field: a field without contacts.
         account: the field, at its minimum.
         k: the contact.
-        kind: what it is instead.
+        kinds: what it may be instead.
         frame: the data.
     """
+    begun = [_Begun.of(fit, field, account, k, kind, frame) for kind in kinds]
+    steps = fit.steps_to(account.fitted, [each.drawing for each in begun], frame.measured)
+    return [
+        _of_kind(fit, account, k, each, step, frame)
+        for each, step in zip(begun, steps, strict=True)
+    ]
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """Contacts with one of another kind, to start from."""
+
+    family: PressureField
+    each: FloatArray  # (K, COLUMNS) all contacts
+    own: IntArray  # (m,) what it is instead
+    drawing: Drawing  # of them all, where those alone are fitted
+
+    @classmethod
+    def of(
+        cls, fit: FieldFit, field: PressureField, account: Account, k: int, kind: Kind, frame: Frame
+    ) -> _Begun:
+        each, own = with_kind(fit, field, account, k, kind)
+        family = field.of(each, fits_peaks=frame.fits_peaks)
+        is_own = np.isin(np.arange(family.count), own)
+        alone = replace(family, free=family.free & is_own[:, None])
+        return cls(family, each, own, alone.draw(alone.join(each)))
+
+
+def _of_kind(
+    fit: FieldFit, account: Account, k: int, begun: _Begun, step: Step, frame: Frame
+) -> Foreseen:
+    family, each, own = begun.family, begun.each, begun.own
     old, light = account.family, account.is_hardly_pressed[k]
-    each, own = with_kind(fit, field, account, k, kind)
-    family = field.of(each, fits_peaks=frame.fits_peaks)
     is_own = np.isin(np.arange(family.count), own)
-    alone = replace(family, free=family.free & is_own[:, None])
-    step, by_own, by_ratio = fit.step_to(
-        account.fitted, alone.draw(alone.join(each)), frame.measured
-    )
-    jacobian = np.empty((len(step), len(family.join(each)) + 1))
+    jacobian = np.empty((len(step.residual), len(family.join(each)) + 1))
     kept = np.delete(old.index, k, axis=0)
     jacobian[:, family.index[~is_own][family.free[~is_own]]] = account.jacobian[:, kept[kept >= 0]]
-    jacobian[:, family.index[own][family.free[own]]] = by_own
-    jacobian[:, -1] = account.jacobian[:, -1] + by_ratio
-    residual, log_ratio = account.fitted.residual + step, account.fitted.log_ratio
+    jacobian[:, family.index[own][family.free[own]]] = step.by_parameters
+    jacobian[:, -1] = account.jacobian[:, -1] + step.by_ratio
+    residual, log_ratio = account.fitted.residual + step.residual, account.fitted.log_ratio
     at = _At(
         family, family.bounded(family.join(each)), log_ratio, residual, jacobian, is_own & light
     )

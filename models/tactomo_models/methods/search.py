@@ -55,7 +55,11 @@ FEW_STEPS = 4  # of starts that are compared: a start's cost says little before
 # Of a fit in one go, before what is left is looked at; of one that is unexplained, which may have
 # far to go.
 STEPS, FAR_STEPS = 4, 20
-HOPELESS = -6.0  # logarithm of odds: what is foreseen below is not solved for
+HOPELESS = -6.0  # logarithm of odds: what is foreseen below is asked no more
+# Logarithm of odds: what is foreseen above is solved for, since the place of a contact turns on it.
+# Of 150 rivals of mixed presses, what was foreseen was right to 0.3 (median; 1.3 for 95 %). With -6
+# a cold frame has a fifth more solves and the same maps; with -1, maps at 20 dB lose 0.002.
+DOUBTFUL = -2.0
 SURE_STEPS = 6  # of a fit of two contacts from afar, before what it foresees is believed
 # Of chi-squared: what the Jacobian foresees of a last step is taken for true, without a solve.
 FORESEEN = 0.5
@@ -442,20 +446,25 @@ class Search:
         """Ask a contact whether it is of other kinds."""
         account = belief.account
         mine, now = dict(belief.rivals[k]), at_end(self.fit, account, frame)
+        # Of two contacts in place of one that explains little the Jacobian foresees nothing.
         explains_little = account.chi_squared > SURPRISE * frame.likelihood.count
-        for kind in kinds:
+        from_start = [kind for kind in kinds if kind is Kind.TWO and explains_little]
+        ahead = [kind for kind in kinds if kind not in from_start]
+        found = dict(
+            zip(ahead, foreseen(self.fit, self.field, account, k, ahead, frame), strict=True)
+        )
+        for kind, each in found.items():
             frame.budget.spend(account.fitted)  # about what asking takes, beside solves
-            if kind is Kind.TWO and explains_little:  # of which the Jacobian foresees nothing
-                each, own = with_kind(self.fit, self.field, account, k, kind)
-                start = self._account(each, account.fitted.log_ratio, frame)
-                found = self._checked(start, own, now, frame, FAR_STEPS, SURE_STEPS)
-            else:
-                found = foreseen(self.fit, self.field, account, k, kind, frame)
-                if found.log_evidence - now.log_evidence > HOPELESS:
-                    start = self._account(found.every, found.log_ratio, frame)
-                    found = self._checked(start, found.own, now, frame)
-            log_odds = found.log_evidence - now.log_evidence
-            mine[kind] = rival_of(found, log_odds, account.contacts[k], mine.get(kind))
+            if each.log_evidence > now.log_evidence + DOUBTFUL:
+                start = self._account(each.every, each.log_ratio, frame)
+                found[kind] = self._checked(start, each.own, now, frame)
+        for kind in from_start:
+            every, own = with_kind(self.fit, self.field, account, k, kind)
+            start = self._account(every, account.fitted.log_ratio, frame)
+            found[kind] = self._checked(start, own, now, frame, FAR_STEPS, SURE_STEPS)
+        for kind, each in found.items():
+            log_odds = each.log_evidence - now.log_evidence
+            mine[kind] = rival_of(each, log_odds, account.contacts[k], mine.get(kind))
         rivals = (*belief.rivals[:k], mine, *belief.rivals[k + 1 :])
         return replace(belief, rivals=rivals)
 

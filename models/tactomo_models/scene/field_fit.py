@@ -15,7 +15,7 @@ Jacobian go by the pressed area.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
@@ -105,6 +105,15 @@ class FittedField:
     def misfit_of(self, channel: Channel) -> float:
         """The same of one sheet."""
         return float(np.sqrt(np.mean(self.residuals[channel] ** 2)))
+
+
+@dataclass(frozen=True)
+class Step:
+    """What another drawing changes, as far as the Jacobian foresees it."""
+
+    residual: FloatArray  # (sum M + K,) added to the weighted residual
+    by_parameters: FloatArray  # (sum M + K, N) derivative by the drawing's free parameters
+    by_ratio: FloatArray  # (sum M + K,) added to the derivative by the log ratio
 
 
 class Budget:
@@ -309,53 +318,69 @@ class FieldFit:
         graded = {Channel.MAGNITUDE: measured[Channel.MAGNITUDE]}
         return self.jacobian(fitted, graded, family.draw(family.join(each)))
 
-    def step_to(
-        self, fitted: FittedField, other: Drawing, measured: Measured
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Foresee what another drawing changes, from the fitted field and without a solve.
+    def steps_to(
+        self, fitted: FittedField, others: Sequence[Drawing], measured: Measured
+    ) -> list[Step]:
+        """Foresee what each of other drawings changes, from the fitted field and without a solve.
 
         The voltages go by the nodes' conductivities as the Jacobian has it, but a step from c to c'
         counts as that of a small disc, 2 c (c' - c) / (c' + c): in one that conducts well there is
         little field (Ammari & Kang, Springer 2004, polarisation tensors).
-
-        Returns:
-            What the weighted residual (sum M + K,) changes by, its derivative (sum M + K, N) by the
-            drawing's free parameters, and the change (sum M + K,) of that by the log ratio.
         """
-        slopes, sheets = other.slopes(), []
+        counts = [2 + other.slopes()[0].shape[1] for other in others]
+        ends = np.cumsum(counts)[:-1]
+        drawings = [fitted.drawing, *others]
+        nodes = np.unique(np.concatenate([each.nodes for each in drawings]))
+        rows = [np.searchsorted(nodes, each.nodes) for each in drawings]
+        sheets = []
         for name, changes in measured.items():
             sheet = self.sheet(name)
-            before, _, by_ratio = self._conducting(name, fitted.drawing, fitted.log_ratio)
-            after, by, by_ratio_after = self._conducting(name, other, fitted.log_ratio)
-            by_share, by_pressure = slopes[:2] if name == Channel.STRUCTURE else slopes[2:]
-            factor = 2 * before / (before + after)
-            columns = np.zeros((len(before), 2 + by_share.shape[1]))
-            columns[:, 0] = factor * (after - before)
-            columns[other.nodes, 1:-1] = by[0][:, None] * by_share + by[1][:, None] * by_pressure
-            columns[:, 1:-1] *= (factor**2)[:, None]
-            columns[:, -1] = factor**2 * by_ratio_after - by_ratio
-            where = np.flatnonzero(columns.any(axis=1))
-            onto = sheet.at_rest[where, None] * columns[where]
+            before, by_ratio = np.ones(len(nodes)), np.zeros(len(nodes))
+            before[rows[0]], _, by_ratio[rows[0]] = self._conducting(
+                name, fitted.drawing, fitted.log_ratio
+            )
+            columns = np.zeros((len(nodes), sum(counts)))
+            for other, at, into in zip(
+                others, rows[1:], np.split(columns, ends, axis=1), strict=True
+            ):
+                conducting, by, by_ratio_after = self._conducting(name, other, fitted.log_ratio)
+                after = np.ones(len(nodes))
+                after[at] = conducting
+                slopes = other.slopes()
+                by_share, by_pressure = slopes[:2] if name == Channel.STRUCTURE else slopes[2:]
+                factor = 2 * before / (before + after)
+                into[:, 0] = factor * (after - before)
+                into[at, 1:-1] = by[0][:, None] * by_share + by[1][:, None] * by_pressure
+                into[at, -1] = by_ratio_after
+                into[:, 1:] *= (factor**2)[:, None]
+                into[:, -1] -= by_ratio
+            moved = columns.any(axis=1)
+            where = nodes[moved]
+            onto = sheet.at_rest[where, None] * columns[moved]
             voltages = sheet.jacobian(fitted.solutions[name], where, onto)
             sheets.append(changes.weighted(voltages / np.abs(sheet.bare_voltages)[:, None]))
         if isinstance(measured, SheetsAndCompanions):
             weights = measured.rows[0]
-            change = _felt(weights, other) - _felt(weights, fitted.drawing)
-            sheets.append(np.column_stack([change, _felt_slopes(weights, other)]))
-        step, by_parameters, by_ratio = np.split(np.concatenate(sheets), [1, -1], axis=1)
-        return step[:, 0], by_parameters, by_ratio[:, 0]
+            before = _felt(weights, fitted.drawing)
+            felt = [
+                np.column_stack([_felt(weights, other) - before, _felt_slopes(weights, other)])
+                for other in others
+            ]
+            sheets.append(np.hstack(felt))
+        return [
+            Step(each[:, 0], each[:, 1:-1], each[:, -1])
+            for each in np.split(np.concatenate(sheets), ends, axis=1)
+        ]
 
     def _conducting(
         self, name: Channel, drawing: Drawing, log_ratio: float
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Conductivity ratios (P,), slopes (2, n) by share and pressure, (P,) by the log ratio."""
+        """Conductivity ratios (n,), slopes (2, n) by share and pressure, (n,) by the log ratio."""
         pressed = self._pressed(name, drawing, log_ratio)
         found, slopes = pressed.response.conductivity(
             pressed.share, pressed.pressure_kpa, log_ratio
         )
-        ratio, by_ratio = np.ones(len(self.forward.at_rest)), np.zeros(len(self.forward.at_rest))
-        ratio[drawing.nodes], by_ratio[drawing.nodes] = found, slopes[2]
-        return ratio, slopes[:2], by_ratio
+        return found, slopes[:2], slopes[2]
 
     def refine(
         self,
