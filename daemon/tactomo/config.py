@@ -28,7 +28,7 @@ from tactomo.endpoint import (
     needs_keys,
     next_address,
 )
-from tactomo.errors import ConfigError
+from tactomo.errors import ConfigError, os_errors_as
 from tactomo.log import LogFormat, LogLevel
 from tactomo.protocols import NATIVE, find_protocol
 
@@ -298,11 +298,8 @@ def _known_keys(items: Sequence[ErrorDetails]) -> str:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return read_toml(path)
-    except OSError as error:
-        raise ConfigError(
-            f"cannot read {path}: {error.strerror}", "give the path of a TOML file"
-        ) from error
+        with os_errors_as(ConfigError, f"cannot read {path}", "give the path of a TOML file"):
+            return read_toml(path)
     except ValueError as error:
         raise ConfigError(
             f"{path} is not valid TOML: {error}", "compare it with `tactomo service example`"

@@ -45,6 +45,17 @@ def needs(what: str, install: str) -> Iterator[None]:
         raise TactomoError(f"{what} needs {error.name}, which is not installed", install) from error
 
 
+@contextmanager
+def os_errors_as(
+    kind: type[TactomoError], cause: str, next_step: str, name: str | None = None
+) -> Iterator[None]:
+    """Raise `kind` where the operating system refuses what a block does, with its reason."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{cause}: {error.strerror or error}", next_step, name) from error
+
+
 class ConfigError(TactomoError):
     """The configuration cannot be used."""
 

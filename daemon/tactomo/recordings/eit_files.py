@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tactomo_models.foreign_file import read_regular
 
-from tactomo.errors import TactomoError
+from tactomo.errors import TactomoError, os_errors_as
 
 SUFFIX: Final = ".eit"
 HEADERS: Final = (9, 11, 18)
@@ -81,12 +81,10 @@ def read_eit_files(paths: Sequence[Path]) -> dict[str, NDArray[Any]]:
 
 
 def _read(path: Path) -> _Frame:
+    step = f"give the path of a {SUFFIX} file"
     try:
-        lines = read_regular(path, MAX_BYTES).decode("ascii").splitlines()
-    except OSError as error:
-        raise EitFileError(
-            f"cannot read {path}: {error.strerror}", f"give the path of a {SUFFIX} file"
-        ) from error
+        with os_errors_as(EitFileError, f"cannot read {path}", step):
+            lines = read_regular(path, MAX_BYTES).decode("ascii").splitlines()
     except UnicodeDecodeError as error:
         raise EitFileError(f"{path} is not text", _ANOTHER) from error
     return _Lines(path, lines).frame()

@@ -41,7 +41,7 @@ from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
 from tactomo_models.sensor.pattern import rim_signs, touching
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
 
-from tactomo.errors import TactomoError
+from tactomo.errors import TactomoError, os_errors_as
 from tactomo.recordings.eit_files import SUFFIX, eit_files, read_eit_files
 from tactomo.scans import MAX_QUADRATURE
 
@@ -232,13 +232,9 @@ def load_arrays(path: Path | Sequence[Path]) -> dict[str, NDArray[Any]]:
             f"{len(files)} files were given, not all of them {SUFFIX}", "give one at a time"
         )
     [one] = files
-    try:
+    step = f"give the path of a file such as .npz, {SUFFIX}, .mat or .csv"
+    with os_errors_as(ImportFileError, f"cannot read {one}", step):
         return read_arrays(one)
-    except OSError as error:
-        raise ImportFileError(
-            f"cannot read {one}: {error.strerror or error}",
-            f"give the path of a file such as .npz, {SUFFIX}, .mat or .csv",
-        ) from error
 
 
 def is_single_ended(arrays: Mapping[str, Any]) -> bool:

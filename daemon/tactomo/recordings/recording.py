@@ -62,7 +62,7 @@ from tactomo_models import CalibrationError, Reference, SensorDescription, load_
 from tactomo_models.calibration.calibration_file import PressureCalibration, parse_calibration
 from tactomo_models.errors import DescriptionError
 from tactomo_models.sensor.description_file import parse_description, shipped_descriptions
-from tactomo_protocol import Channel, Hello, Scan
+from tactomo_protocol import Channel, Hello, Packet, Scan
 
 from tactomo.errors import ConfigError, RecordingError
 from tactomo.protocols import NATIVE, PortProtocol, protocol_named
@@ -157,6 +157,7 @@ class Summary:
     scans: dict[Channel, int] = field(default_factory=dict)
     hellos: dict[Hello, None] = field(default_factory=dict)
     """The distinct ones as keys, in the order in which they were heard."""
+    packets: int = 0  # that came intact over the ports
     corrupt: int = 0  # frames on the ports that were damaged
     faulty: int = 0  # intact ones that break the protocol
     frames: int = 0  # dual scans that the daemon reconstructed while it recorded
@@ -214,6 +215,13 @@ class Recording:
         """
         for message in self.port_messages(port, from_ns):
             yield Chunk(max(message.log_time, from_ns), message.data)
+
+    def packets(self, port: int) -> Iterator[tuple[int, Packet]]:
+        """Yield what port `port` said, decoded, each packet with its time as `Chunk` has it."""
+        protocol = self.origin.new_protocol()
+        for clock_ns, data in self.chunks(port):
+            for packet in protocol.feed(data):
+                yield clock_ns, packet
 
     def port_messages(self, port: int, from_ns: int = 0) -> Iterator[Message]:
         """Yield the same as messages, with the time on the wall clock, too."""
@@ -303,8 +311,10 @@ def _summarise(path: Path, origin: Origin) -> Summary:
                 if not extra:
                     _count_bytes(summary, int(number), record)
                 _count_packets(summary, decoders[int(number)], record.data)
-    summary.corrupt = sum(decoder.counts.damaged for decoder in decoders.values())
-    summary.faulty = sum(decoder.counts.faulty for decoder in decoders.values())
+    counts = [decoder.counts for decoder in decoders.values()]
+    summary.packets = sum(each.packets for each in counts)
+    summary.corrupt = sum(each.damaged for each in counts)
+    summary.faulty = sum(each.faulty for each in counts)
     summary.references = len(references)
     summary.has_more = bool(stops) and _has_chunks(path, stops[0])
     return summary

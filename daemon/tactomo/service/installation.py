@@ -24,7 +24,7 @@ from typing import Final, Literal
 from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM
 
 from tactomo.endpoint import next_address
-from tactomo.errors import ServiceError
+from tactomo.errors import ServiceError, os_errors_as
 
 Effect = Literal["write", "replace", "remove", "keep", "unchanged"]
 
@@ -180,12 +180,8 @@ def check_running_systemd() -> None:
 
 def run(command: Sequence[str]) -> str:
     """Run a program of the system and return what it says; raise ServiceError if it fails."""
-    try:
+    with os_errors_as(ServiceError, f"cannot run {command[0]}", "is it installed?"):
         done = subprocess.run(command, capture_output=True, text=True, check=False)
-    except OSError as error:
-        raise ServiceError(
-            f"cannot run {command[0]}: {error.strerror}", "is it installed?"
-        ) from error
     if done.returncode:
         raise ServiceError(
             f"`{' '.join(command)}` failed: {(done.stderr or done.stdout).strip()}",

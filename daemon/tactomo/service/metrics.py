@@ -17,7 +17,7 @@ from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 from tactomo_client.connection import names_this_computer
 from tactomo_models import Flag
 
-from tactomo.errors import AddressError, needs
+from tactomo.errors import AddressError, needs, os_errors_as
 from tactomo.timing import Durations
 from tactomo.worker import Worker
 
@@ -68,13 +68,9 @@ class MetricsServer(Worker):
         """Bind ``HOST:PORT``; raise AddressError where the address cannot be had."""
         parts = urlsplit(f"//{endpoint}")
         host, port = parts.hostname or "", parts.port or 0
-        try:
+        step = "stop what uses this port, or give another one as metrics"
+        with os_errors_as(AddressError, f"cannot offer metrics at {endpoint}", step):
             self._server = make_server(host, port, _only_for(host, self._app), _Server, _Handler)
-        except OSError as error:
-            raise AddressError(
-                f"cannot offer metrics at {endpoint}: {error.strerror or error}",
-                "stop what uses this port, or give another one as metrics",
-            ) from error
         self.address = f"http://{host}:{self._server.server_port}/metrics"
 
     def _close(self) -> None:

@@ -23,7 +23,7 @@ import struct
 import tty
 from pathlib import Path
 
-from tactomo.errors import TactomoError
+from tactomo.errors import TactomoError, os_errors_as
 
 READ_BYTES = 4096
 HOLDER_WAIT_S = 1.0
@@ -149,16 +149,12 @@ class SerialLine:
     def _make_link(self) -> None:
         if self._link is None:
             return
-        try:
+        step = "give --link a folder that you may write to"
+        with os_errors_as(TactomoError, f"cannot make the link {self._link}", step):
             self._link.parent.mkdir(parents=True, exist_ok=True)
             if self._link.is_symlink():  # left over from a twin that was killed
                 self._link.unlink()
             self._link.symlink_to(self._device)
-        except OSError as error:
-            raise TactomoError(
-                f"cannot make the link {self._link}: {error.strerror}",
-                "give --link a folder that you may write to",
-            ) from error
 
     def _remove_link(self) -> None:
         """Remove the link, unless somebody has meanwhile taken the name."""

@@ -31,7 +31,7 @@ from tactomo_models import Press
 from tactomo_models.simulation.skin_drift import SkinDrift
 from tactomo_models.toml_file import read_toml
 
-from tactomo.errors import ConfigError
+from tactomo.errors import ConfigError, os_errors_as
 from tactomo.stream.commands import explained
 
 Millimetres = Annotated[float, Field(ge=-1000.0, le=1000.0, allow_inf_nan=False)]
@@ -205,13 +205,10 @@ def load_scene(source: str | Path) -> Scene:
     out of range; the message names the key, its value and what is allowed.
     """
     path = SHIPPED.get(str(source), Path(source))
+    step = f"give the path of a TOML file, or one of: {', '.join(SHIPPED)}"
     try:
-        return Scene.model_validate(read_toml(path))
-    except OSError as error:
-        raise ConfigError(
-            f"cannot read the scene {path}: {error.strerror}",
-            f"give the path of a TOML file, or one of: {', '.join(SHIPPED)}",
-        ) from error
+        with os_errors_as(ConfigError, f"cannot read the scene {path}", step):
+            return Scene.model_validate(read_toml(path))
     except ValidationError as error:
         raise ConfigError(f"{path}: {explained(error)}", "correct the file") from error
     except ValueError as error:

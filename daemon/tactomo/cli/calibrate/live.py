@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from tactomo.cli.steer.watch import View
-from tactomo.errors import TactomoError
+from tactomo.errors import TactomoError, os_errors_as
 
 if TYPE_CHECKING:
     from tactomo_client import Frame, Status
@@ -368,7 +368,8 @@ def _is_begun(log: Path) -> bool:
 
 def _append(log: Path, row: dict[str, str]) -> None:
     """Add a line; raise TactomoError where that cannot be done."""
-    try:
+    step = "give --output in a folder that you may write"
+    with os_errors_as(TactomoError, f"cannot write {log}", step):
         log.parent.mkdir(parents=True, exist_ok=True)
         is_new = not log.exists()
         with log.open("a", encoding="utf-8", newline="") as file:
@@ -376,7 +377,3 @@ def _append(log: Path, row: dict[str, str]) -> None:
             if is_new:
                 writer.writeheader()
             writer.writerow(row)
-    except OSError as error:
-        raise TactomoError(
-            f"cannot write {log}: {error.strerror}", "give --output in a folder that you may write"
-        ) from error

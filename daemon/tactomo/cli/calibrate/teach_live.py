@@ -18,7 +18,7 @@ from tactomo_models.scans.plausibility import Flag
 from tactomo_models.sensor.description import SensorDescription
 
 from tactomo.cli.doctor.evidence import Evidence, of_daemon
-from tactomo.errors import TactomoError
+from tactomo.errors import TactomoError, os_errors_as
 
 if TYPE_CHECKING:
     from tactomo.cli.console import Console
@@ -176,12 +176,9 @@ class _Session:
                 rows = row if rows is None else np.concatenate([rows, row])
             if rows is not None:
                 self._arrays[name] = rows
-        try:
+        step = "give --presses a file to write"
+        with os_errors_as(TactomoError, f"cannot write {self._file}", step):
             write_arrays(self._file, self._arrays)
-        except OSError as error:
-            raise TactomoError(
-                f"cannot write {self._file}: {error.strerror}", "give --presses a file to write"
-            ) from error
 
 
 def suggested_mm(description: SensorDescription, number: int) -> tuple[float, float]:

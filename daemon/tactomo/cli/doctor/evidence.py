@@ -266,25 +266,24 @@ def of_recording(recording: Recording, description: str | None, frames: slice | 
     Raises DoctorError where there are no scans in it.
     """
     known = load_description(description) if description else recording.origin.read_description()
-    ports = [_PortScans(recording, n) for n in range(len(recording.origin.ports))]
+    ports = [_scans_of_port(recording, n) for n in range(len(recording.origin.ports))]
     scans: dict[str, FloatArray] = {}
     times_s: dict[str, FloatArray | None] = {}
     saturated: dict[str, int] = {}
     for channel in Channel:
-        taken = [scan for port in ports for scan in port.scans if scan.channel is channel]
+        taken = [scan for port in ports for scan in port if scan.channel is channel]
         taken = taken if frames is None else taken[frames]
         if taken and channel in known.channels:
-            name = channel
-            scans[name] = np.array([scan.volts for scan in taken])
-            times_s[name] = _times([s.device_us for s in taken], [s.arrived_ns for s in taken])
-            saturated[name] = sum(bool(scan.flags & ScanFlag.SATURATED) for scan in taken)
+            scans[channel] = np.array([scan.volts for scan in taken])
+            times_s[channel] = _times([s.device_us for s in taken], [s.arrived_ns for s in taken])
+            saturated[channel] = sum(bool(scan.flags & ScanFlag.SATURATED) for scan in taken)
     if not scans:
         raise DoctorError(
             f"there are no scans of {known.name} in {recording.path}",
             "`tactomo info` shows what is in it; it may need another --description",
         )
     evidence = Evidence(str(recording.path), known, scans, times_s, saturated)
-    evidence.heard = _heard_on_ports(ports)
+    evidence.heard = _heard_on_ports(recording, ports)
     if not recording.summary.is_complete:
         evidence.notes = ("the recording was cut off: what is there was read",)
     return evidence
@@ -301,29 +300,24 @@ class _Taken(NamedTuple):
     arrived_ns: int
 
 
-class _PortScans:
-    """All scans that one port of a recording brought."""
-
-    def __init__(self, recording: Recording, port: int) -> None:
-        decoder = recording.origin.new_protocol()
-        hello: Hello | None = None
-        self.scans: list[_Taken] = []
-        for chunk in recording.chunks(port):
-            for packet in decoder.feed(chunk.data):
-                if isinstance(packet, Hello):
-                    hello = packet
-                elif isinstance(packet, Scan) and hello is not None:
-                    volts = packet.volts(hello.volts_per_count)
-                    kept = (packet.channel, packet.counter, packet.device_us, packet.flags)
-                    self.scans.append(_Taken(*kept, volts, chunk.clock_ns))
-        self.counts = decoder.counts
+def _scans_of_port(recording: Recording, port: int) -> list[_Taken]:
+    hello: Hello | None = None
+    scans: list[_Taken] = []
+    for clock_ns, packet in recording.packets(port):
+        if isinstance(packet, Hello):
+            hello = packet
+        elif isinstance(packet, Scan) and hello is not None:
+            volts = packet.volts(hello.volts_per_count)
+            kept = (packet.channel, packet.counter, packet.device_us, packet.flags)
+            scans.append(_Taken(*kept, volts, clock_ns))
+    return scans
 
 
-def _heard_on_ports(ports: list[_PortScans]) -> Heard:
+def _heard_on_ports(recording: Recording, ports: list[list[_Taken]]) -> Heard:
     delays, periods, lost = [], [], 0
     for port in ports:
-        for channel in {scan.channel for scan in port.scans}:
-            scans = [scan for scan in port.scans if scan.channel is channel]
+        for channel in {scan.channel for scan in port}:
+            scans = [scan for scan in port if scan.channel is channel]
             device_ms = np.array([scan.device_us for scan in scans]) * 1e-3
             counters = [scan.counter for scan in scans]
             lost = max(lost, _gaps(counters))
@@ -331,9 +325,9 @@ def _heard_on_ports(ports: list[_PortScans]) -> Heard:
             periods.append(_period(device_ms, counters))
     known = [period for period in periods if period is not None]
     return Heard(
-        sum(port.counts.packets for port in ports),
-        sum(port.counts.damaged for port in ports),
-        sum(port.counts.faulty for port in ports),
+        recording.summary.packets,
+        recording.summary.corrupt,
+        recording.summary.faulty,
         lost,
         np.concatenate(delays) if delays else np.zeros(0),
         min(known) if known else None,

@@ -22,7 +22,7 @@ from tactomo.cli.options import Force, Pose, RecordedDescription, examples, type
 from tactomo.cli.output import say
 from tactomo.cli.plot.plot import prepare_file
 from tactomo.cli.run.foxglove import placement_of, write_layout
-from tactomo.errors import TactomoError, needs
+from tactomo.errors import TactomoError, needs, os_errors_as
 
 if TYPE_CHECKING:
     from tactomo_client import Frame
@@ -133,13 +133,9 @@ def export(
         moments = frames.moments("contacts" if kind == ".csv" else "map")
         watched = gaps.watch(frames.with_progress(moments, "exporting"))
         into = _write_folder if is_folder else _write_file
-        try:
+        step = "make room, or name a file that you may write"
+        with os_errors_as(TactomoError, f"cannot write {output}", step):
             count = into(output, lambda out: write(frames, watched, out))
-        except OSError as error:
-            raise TactomoError(
-                f"cannot write {output}: {error.strerror or error}",
-                "make room, or name a file that you may write",
-            ) from error
         if layout is not None:
             write_layout(layout, frames.sensor)
     for line in (*gaps.lines(), *told):

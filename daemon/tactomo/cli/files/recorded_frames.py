@@ -118,16 +118,10 @@ def _arrivals(path: Path) -> Iterator[tuple[int, int]]:
     from tactomo.recordings.recording import open_recording
 
     recording = open_recording(path)
-
-    def of_port(port: int) -> Iterator[tuple[int, int]]:
-        protocol = recording.origin.new_protocol()
-        for clock_ns, data in recording.chunks(port):
-            for packet in protocol.feed(data):
-                if isinstance(packet, Scan):
-                    yield packet.counter, clock_ns
-
-    ports = [of_port(port) for port in range(len(recording.origin.ports))]
-    return heapq.merge(*ports, key=lambda arrival: arrival[1])
+    ports = map(recording.packets, range(len(recording.origin.ports)))
+    for clock_ns, packet in heapq.merge(*ports, key=lambda arrival: arrival[0]):
+        if isinstance(packet, Scan):
+            yield packet.counter, clock_ns
 
 
 @contextlib.contextmanager

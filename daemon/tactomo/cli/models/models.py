@@ -72,16 +72,15 @@ def copy(
     """Copy a shipped sensor description to a file of your own, to be changed there."""
     from tactomo_models.sensor.description_file import shipped_text
 
-    from tactomo.errors import TactomoError
+    from tactomo.errors import TactomoError, os_errors_as
 
     text = shipped_text(name)
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except OSError as error:
-        raise TactomoError(
-            f"cannot write {path}: {error.strerror}", "give the path of a file that is not there"
-        ) from error
+    step = "give the path of a file that is not there"
+    with (
+        os_errors_as(TactomoError, f"cannot write {path}", step),
+        path.open("x", encoding="utf-8") as file,
+    ):
+        file.write(text)
     say(f"wrote {path}; give it to --description")
 
 

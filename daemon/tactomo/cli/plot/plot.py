@@ -12,7 +12,7 @@ import typer
 from tactomo.cli.files.recorded_frames import FromOption, ToOption, recorded_frames
 from tactomo.cli.options import Force, RecordedDescription, examples, typer_app
 from tactomo.cli.output import say
-from tactomo.errors import TactomoError, needs
+from tactomo.errors import TactomoError, needs, os_errors_as
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -119,12 +119,9 @@ def prepare_folder(folder: Path) -> None:
 
     Raises TactomoError as `prepare_picture` does, or where the folder cannot be made.
     """
-    try:
+    step = "give one that you may write"
+    with os_errors_as(TactomoError, f"cannot make the folder {folder}", step):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise TactomoError(
-            f"cannot make the folder {folder}: {error.strerror}", "give one that you may write"
-        ) from error
     prepare_picture(folder / "figure.png")
 
 
@@ -151,14 +148,10 @@ def prepare_file(output: Path, *, force: bool = True, source: Path | None = None
         can_ask = sys.stdin.isatty() and sys.stderr.isatty()
         if not can_ask or not typer.confirm(f"{output} exists: write over it?", err=True):
             raise TactomoError(f"{output} exists already", "name another file, or add --force")
-    try:
+    with os_errors_as(TactomoError, f"cannot write {output}", "name a file that you may write"):
         output.open("ab").close()
         if is_new:
             output.unlink()
-    except OSError as error:
-        raise TactomoError(
-            f"cannot write {output}: {error.strerror}", "name a file that you may write"
-        ) from error
 
 
 def save_figure(figure: Figure, output: Path, dpi: int = 150) -> None:

@@ -11,7 +11,7 @@ from tactomo.cli import options
 from tactomo.cli.children import print_ready, stop_asked
 from tactomo.cli.output import say
 from tactomo.cli.sensors import find_sensor
-from tactomo.errors import TactomoError, needs
+from tactomo.errors import TactomoError, needs, os_errors_as
 
 if TYPE_CHECKING:
     from tactomo_client.appearance import Placement
@@ -106,12 +106,8 @@ def write_layout(path: Path, sensor: str) -> None:
     """Write the layout that shows a sensor; raise TactomoError where it cannot be written."""
     from tactomo_foxglove import layout_for
 
-    try:
+    with os_errors_as(TactomoError, f"cannot write {path}", "name a file that you may write"):
         path.write_text(layout_for(sensor), "utf-8")
-    except OSError as error:
-        raise TactomoError(
-            f"cannot write {path}: {error.strerror}", "name a file that you may write"
-        ) from error
 
 
 def placement_of(parent: str, pose: str) -> Placement:
