@@ -64,8 +64,8 @@ typedef struct {
 
 /* The areas around pressed nodes; (t,) triangles, (n,) nodes. */
 typedef struct {
-  int64_t triangles, nodes, layers, rim, near;
-  int64_t is_known;  /* whether `both` and `bare` are filled */
+  int64_t triangles, nodes, layers, rim;
+  int64_t is_known;  /* whether `both` and `rest` are filled */
   int64_t *triangle; /* (t,) area by area */
   int64_t *corner;   /* (t, 3) places among the nodes */
   int64_t *node;     /* (n,) positions in the support, area by area, layer by layer inwards */
@@ -73,7 +73,8 @@ typedef struct {
   int64_t *depth;    /* (n,) */
   int64_t *layer;    /* (n,) */
   double *both;      /* (rim, rim + fields), G and u0 side by side */
-  double *bare;      /* (rim, rim + fields): what the bare areas' stiffness makes of both */
+  double *rest;      /* (rim, rim) at most: of each bare area the stiffness (size, size) condensed
+                      * onto its rim, one after the other */
 } Areas;
 
 /* Find the areas around nodes (count,); buffers of `areas` are large enough for any. Returns
@@ -113,7 +114,7 @@ int find_areas(const Sheet *s, int64_t count, const int64_t *where, Areas *a) {
         depth[next] = depth[queue[head]] + 1, queue[tail++] = next;
     }
   /* Connected parts; within each its triangles, and its nodes by depth. */
-  a->nodes = n, a->triangles = a->layers = a->rim = a->near = a->is_known = 0;
+  a->nodes = n, a->triangles = a->layers = a->rim = a->is_known = 0;
   int64_t done = 0, areas = 0;
   for (int64_t i = 0; i < S; i++) {
     if (!there[i] || part[i] >= 0) continue;
@@ -131,7 +132,7 @@ int find_areas(const Sheet *s, int64_t count, const int64_t *where, Areas *a) {
       for (int64_t j = 0; j < last; j++)
         if (depth[queue[j]] == d) {
           a->depth[done] = d, a->layer[done] = a->layers, a->node[done] = queue[j];
-          a->rim += d == 0, a->near += d <= 1;
+          a->rim += d == 0;
           place[queue[j]] = done++;
         }
       a->layers++;
@@ -153,142 +154,19 @@ int find_areas(const Sheet *s, int64_t count, const int64_t *where, Areas *a) {
   return done != n ? UNSOLVABLE : 0;
 }
 
-/* Rows (rim, most_near) of the bare areas' stiffness: columns among the near nodes, values. */
-static void rim_law(const Sheet *s, const Areas *a, const int64_t *row, const int64_t *column,
-                    int64_t *entries, int64_t *at, double *value) {
-  memset(entries, 0, sizeof(int64_t) * a->rim);
-  for (int64_t i = 0; i < a->triangles; i++) {
-    int64_t t = a->triangle[i];
-    const int64_t *corner = a->corner + 3 * i;
-    for (int c = 0; c < 3; c++) {
-      int64_t r = row[corner[c]];
-      if (r < 0) continue;
-      int64_t *places = at + r * s->most_near;
-      double *values = value + r * s->most_near;
-      for (int d = 0; d < 3; d++) {
-        int64_t e = 0;
-        while (e < entries[r] && places[e] != column[corner[d]]) e++;
-        if (e == entries[r]) places[e] = column[corner[d]], values[e] = 0.0, entries[r]++;
-        values[e] += s->conductivity[t] * s->stiffness[9 * t + 3 * c + d];
-      }
-    }
-  }
-}
-
-/* The near nodes of areas, which rows and columns they are, and the bare law at the rims. */
-typedef struct {
-  int64_t *row, *column;         /* (nodes,), -1 elsewhere */
-  int64_t *rim_node, *near_node; /* (rim,), (near,) positions in the support */
-  int64_t *rim_column;           /* (rim,) */
-  int64_t *entries, *at;         /* (rim,), (rim, most_near) */
-  double *value;                 /* (rim, most_near) */
-} Law;
-
-static int find_law(const Sheet *s, const Areas *a, Law *l) {
-  int64_t most = a->rim * s->most_near, rim = 0, near = 0;
-  l->row = malloc(sizeof(int64_t) * (2 * a->nodes + 3 * a->rim + a->near + most + 1));
-  l->value = malloc(sizeof(double) * (most + 1));
-  if (!l->row || !l->value) {
-    free(l->row), free(l->value);
-    return -1;
-  }
-  l->column = l->row + a->nodes, l->rim_node = l->column + a->nodes;
-  l->near_node = l->rim_node + a->rim, l->entries = l->near_node + a->near;
-  l->at = l->entries + a->rim, l->rim_column = l->at + most;
-  for (int64_t i = 0; i < a->nodes; i++) {
-    l->row[i] = l->column[i] = -1;
-    if (a->depth[i] == 0)
-      l->row[i] = rim, l->rim_column[rim] = near, l->rim_node[rim++] = a->node[i];
-    if (a->depth[i] <= 1) l->column[i] = near, l->near_node[near++] = a->node[i];
-  }
-  rim_law(s, a, l->row, l->column, l->entries, l->at, l->value);
-  return 0;
-}
-
-static double green_at(const Sheet *s, int64_t row, int64_t column) {
-  int64_t more = row > column ? row : column, place = more * (more + 1) / 2 + row + column - more;
-  return s->green_single ? s->green_single[place] : s->green_double[place];
-}
-
-/* Green's function between near nodes and rims, into rows that are `width` apart: what is symmetric
- * is looked up once, along its rows. */
-static void look_up_own(const Sheet *s, const Areas *a, const Law *l, double *green,
-                        int64_t width) {
-  for (int64_t i = 0; i < a->nodes; i++) {
-    if (l->column[i] < 0) continue;
-    int64_t row = a->node[i], is_rim = l->row[i] >= 0;
-    double *into = green + l->column[i] * width;
-    for (int64_t j = 0; j < a->rim; j++)
-      if (!is_rim || l->rim_node[j] <= row) into[j] = green_at(s, row, l->rim_node[j]);
-  }
-  for (int64_t i = 0; i < a->rim; i++)
-    for (int64_t j = 0; j < a->rim; j++)
-      if (l->rim_node[j] > l->rim_node[i])
-        green[l->rim_column[i] * width + j] = green[l->rim_column[j] * width + i];
-}
-
-/* Fill in what areas know of the bare sheet: G and u0 at their rims, and the law on them.
+/* Conductivity of a triangle as its corners have it, and whether none is worse than at rest.
  *
- * given: (near, rim) of the Green's function, where the sheet has it in pieces; else NULL.
- * Either is balanced at inner nodes, so that the bare law, at rims and by their neighbours, does what
- * the bare areas' condensed stiffness does.
+ * change: (pressable,); NULL at rest.
  */
-static int know(const Sheet *s, const double *given, Areas *a) {
-  int64_t r = a->rim, F = s->fields, width = r + F;
-  double *near = malloc(sizeof(double) * (a->near * width + 1));
-  Law l;
-  if (!near || find_law(s, a, &l)) {
-    free(near);
-    return -1;
-  }
-  if (given)
-    for (int64_t i = 0; i < a->near; i++)
-      memcpy(near + i * width, given + i * r, sizeof(double) * r);
-  else
-    look_up_own(s, a, &l, near, width);
-  for (int64_t i = 0; i < a->near; i++)
-    memcpy(near + i * width + r, s->potentials + l.near_node[i] * F, sizeof(double) * F);
-  for (int64_t i = 0; i < a->nodes; i++) {
-    int64_t row = l.row[i];
-    if (row < 0) continue;
-    double *bare = a->bare + row * width;
-    memcpy(a->both + row * width, near + l.column[i] * width, sizeof(double) * width);
-    memset(bare, 0, sizeof(double) * width);
-    for (int64_t e = 0; e < l.entries[row]; e++) {
-      const double *of = near + l.at[row * s->most_near + e] * width;
-      double by = l.value[row * s->most_near + e];
-      for (int64_t j = 0; j < width; j++) bare[j] += by * of[j];
-    }
-  }
-  a->is_known = 1;
-  free(near), free(l.row), free(l.value);
-  return 0;
-}
-
-/* Conductivity of a triangle as its corners have it, and whether none is worse than at rest. */
 static int at_corners(const Sheet *s, int64_t t, const double *change, double sigma[3]) {
   int better = 1;
   for (int c = 0; c < 3; c++) {
     int64_t p = s->corner_pressable[3 * t + c];
-    double by = p < 0 ? 0.0 : change[p];
+    double by = p < 0 || !change ? 0.0 : change[p];
     sigma[c] = s->conductivity[t] + by;
     better &= sigma[c] >= s->conductivity[t];
   }
   return better;
-}
-
-/* Areas condensed onto their rims. */
-typedef struct {
-  int64_t *offset; /* (layers,) */
-  double *flat;    /* of each layer L^-1 E, E its coupling (outer, size) with the next one outwards,
-                    * and L: on rims the stiffness (size, size) that is left */
-  double *system;  /* (rim, rim + fields): (S - S0) (G, u0); then factors of 1 + (S - S0) G, whose
-                    * transpose has columns, in the first of each row */
-  int *pivots;     /* (rim,) */
-} Condensed;
-
-static void forget(Condensed *c) {
-  free(c->offset), free(c->flat), free(c->system), free(c->pivots);
 }
 
 static int size_of(const Areas *a, int64_t layer) { return a->start[layer + 1] - a->start[layer]; }
@@ -297,6 +175,15 @@ static int size_of(const Areas *a, int64_t layer) { return a->start[layer + 1] -
 static int outer_of(const Areas *a, int64_t layer) {
   return a->depth[a->start[layer]] ? size_of(a, layer - 1) : 0;
 }
+
+/* Areas condensed onto their rims. */
+typedef struct {
+  int64_t *offset; /* (layers,) */
+  double *flat;    /* of each layer L^-1 E, E its coupling (outer, size) with the next one outwards,
+                    * and L: on rims the stiffness (size, size) that is left */
+} Condensed;
+
+static void forget(Condensed *c) { free(c->offset), free(c->flat); }
 
 /* Sum triangles into layers: see `Condensed.flat`. */
 static void assemble(const Sheet *s, const Areas *a, int mixes, const double *change,
@@ -321,43 +208,97 @@ static void assemble(const Sheet *s, const Areas *a, int mixes, const double *ch
   }
 }
 
-/* Condense areas, and factor what their rims solve: (1 + (S - S0) G) i = -(S - S0) u0. */
+/* Condense areas, layer by layer outwards. */
 static int condense(const Sheet *s, const Areas *a, int mixes, const double *change,
                     Condensed *c) {
-  int r = a->rim, width = r + s->fields, failed = 0, first = 0;
-  int64_t total = 0, l;
+  int64_t total = 0;
   c->offset = malloc(sizeof(int64_t) * (a->layers + 1));
-  c->system = malloc(sizeof(double) * (r * width + 1)), c->pivots = malloc(sizeof(int) * (r + 1));
-  for (l = 0; c->offset && l < a->layers; l++)
+  for (int64_t l = 0; c->offset && l < a->layers; l++)
     c->offset[l] = total, total += (outer_of(a, l) + size_of(a, l)) * size_of(a, l);
   c->flat = calloc(total + 1, sizeof(double));
-  if (!c->offset || !c->flat || !c->system || !c->pivots) {
+  if (!c->offset || !c->flat) {
     forget(c);
     return -1;
   }
   assemble(s, a, mixes, change, c);
-  /* Eliminate layer by layer outwards. */
-  for (l = a->layers - 1; l >= 0 && !failed; l--) {
-    int size = size_of(a, l), outer = outer_of(a, l);
+  for (int64_t l = a->layers - 1; l >= 0; l--) {
+    int size = size_of(a, l), outer = outer_of(a, l), failed = 0;
     if (!outer) continue;
     double *E = c->flat + c->offset[l], *own = E + outer * size, one = 1.0;
     dpotrf("L", &size, own, &size, &failed);
-    if (failed) break;
+    if (failed) {
+      forget(c);
+      return UNSOLVABLE;
+    }
     dtrsm("L", "L", "N", "N", &size, &outer, &one, own, &size, E, &size);
     multiply('T', 'N', outer, outer, size, -1.0, E, size, E, size, 1.0,
              c->flat + c->offset[l - 1] + outer_of(a, l - 1) * outer, outer);
   }
-  for (l = 0; l < a->layers && !failed; l++) {
+  return 0;
+}
+
+static double green_at(const Sheet *s, int64_t row, int64_t column) {
+  int64_t more = row > column ? row : column, place = more * (more + 1) / 2 + row + column - more;
+  return s->green_single ? s->green_single[place] : s->green_double[place];
+}
+
+/* Fill in what areas know of the bare sheet: G and u0 at their rims, and their stiffness there.
+ *
+ * given: (rim, rim) of the Green's function, where the sheet has it in pieces; else NULL.
+ */
+static int know(const Sheet *s, const double *given, Areas *a) {
+  int64_t r = a->rim, F = s->fields, width = r + F, first = 0;
+  int64_t *node = malloc(sizeof(int64_t) * (r + 1));
+  Condensed bare;
+  int failed = node ? condense(s, a, 0, NULL, &bare) : -1;
+  if (failed) {
+    free(node);
+    return failed;
+  }
+  double *rest = a->rest;
+  for (int64_t l = 0; l < a->layers; l++) {
+    if (a->depth[a->start[l]]) continue;
+    int64_t size = size_of(a, l);
+    memcpy(node + first, a->node + a->start[l], sizeof(int64_t) * size), first += size;
+    memcpy(rest, bare.flat + bare.offset[l], sizeof(double) * size * size), rest += size * size;
+  }
+  for (int64_t i = 0; i < r; i++) {
+    double *row = a->both + i * width;
+    memcpy(row + r, s->potentials + node[i] * F, sizeof(double) * F);
+    if (given) memcpy(row, given + i * r, sizeof(double) * r);
+    for (int64_t j = 0; j < r && !given; j++) /* symmetric: looked up once, along its rows */
+      if (node[j] <= node[i]) row[j] = a->both[j * width + i] = green_at(s, node[i], node[j]);
+  }
+  a->is_known = 1;
+  free(node), forget(&bare);
+  return 0;
+}
+
+/* What rims solve: (1 + (S - S0) G) i = -(S - S0) u0, with S and S0 condensed onto them. */
+typedef struct {
+  double *system; /* (rim, rim + fields): (S - S0) (G, u0); then factors of 1 + (S - S0) G, whose
+                   * transpose has columns, in the first of each row */
+  int *pivots;    /* (rim,) */
+} Rims;
+
+/* Set up what the rims of condensed areas solve, and factor it. */
+static int factor(const Sheet *s, const Areas *a, const Condensed *c, Rims *rims) {
+  int r = a->rim, width = r + s->fields, failed = 0, first = 0;
+  const double *rest = a->rest;
+  rims->system = malloc(sizeof(double) * (r * width + 1));
+  rims->pivots = malloc(sizeof(int) * (r + 1));
+  if (!rims->system || !rims->pivots) return -1;
+  for (int64_t l = 0; l < a->layers; l++) {
     if (a->depth[a->start[l]]) continue;
     int size = size_of(a, l);
-    multiply('N', 'N', width, size, size, 1.0, a->both + first * width, width,
-             c->flat + c->offset[l], size, 0.0, c->system + first * width, width);
-    first += size;
+    double *left = c->flat + c->offset[l];
+    for (int64_t i = 0; i < (int64_t)size * size; i++) left[i] -= rest[i];
+    multiply('N', 'N', width, size, size, 1.0, a->both + first * width, width, left, size, 0.0,
+             rims->system + first * width, width);
+    first += size, rest += size * size;
   }
-  for (int64_t i = 0; i < (int64_t)r * width && !failed; i++) c->system[i] -= a->bare[i];
-  for (int64_t i = 0; i < r && !failed; i++) c->system[i * width + i] += 1.0;
-  if (!failed && r) dgetrf(&r, &r, c->system, &width, c->pivots, &failed);
-  if (failed) forget(c);
+  for (int64_t i = 0; i < r; i++) rims->system[i * width + i] += 1.0;
+  if (r) dgetrf(&r, &r, rims->system, &width, rims->pivots, &failed);
   return failed ? UNSOLVABLE : 0;
 }
 
@@ -416,30 +357,31 @@ static void spread(const Sheet *s, const Areas *a, const Condensed *c, const dou
 }
 
 /* Currents (rim, fields), columns, that rims inject. */
-static void inject(const Sheet *s, const Areas *a, const Condensed *c, double *injected) {
+static void inject(const Sheet *s, const Areas *a, const Rims *rims, double *injected) {
   int F = s->fields, r = a->rim, width = r + F, failed;
   for (int64_t i = 0; i < r; i++)
-    for (int64_t m = 0; m < F; m++) injected[m * r + i] = -c->system[i * width + r + m];
-  if (r) dgetrs("T", &r, &F, c->system, &width, c->pivots, injected, &r, &failed);
+    for (int64_t m = 0; m < F; m++) injected[m * r + i] = -rims->system[i * width + r + m];
+  if (r) dgetrs("T", &r, &F, rims->system, &width, rims->pivots, injected, &r, &failed);
 }
 
 /* Solve for a pressed sheet; see `ForwardModel.solve`. */
 static int solve(const Sheet *s, const Areas *a, const Pressing *p) {
-  int F = s->fields, r = a->rim, width = r + F, failed;
-  double *moved = malloc(sizeof(double) * F * F);
+  int F = s->fields, r = a->rim, width = r + F;
   Condensed c;
-  failed = moved ? condense(s, a, p->mixes_resistivities, p->change, &c) : -1;
-  if (failed) {
-    free(moved);
-    return failed;
+  Rims rims = {NULL, NULL};
+  int failed = condense(s, a, p->mixes_resistivities, p->change, &c);
+  if (failed) return failed;
+  double *moved = malloc(sizeof(double) * F * F);
+  failed = moved ? factor(s, a, &c, &rims) : -1;
+  if (!failed) {
+    inject(s, a, &rims, p->injected);
+    /* u0^T i, by which the electrodes' potentials differ. */
+    multiply('N', 'N', F, F, r, 1.0, a->both + r, width, p->injected, r, 0.0, moved, F);
+    scan(s, moved, p->voltages);
+    spread(s, a, &c, p->injected, p->potentials);
   }
-  inject(s, a, &c, p->injected);
-  /* u0^T i, by which the electrodes' potentials differ. */
-  multiply('N', 'N', F, F, r, 1.0, a->both + r, width, p->injected, r, 0.0, moved, F);
-  scan(s, moved, p->voltages);
-  spread(s, a, &c, p->injected, p->potentials);
-  free(moved), forget(&c);
-  return 0;
+  free(moved), free(rims.system), free(rims.pivots), forget(&c);
+  return failed;
 }
 
 /* What a pressure does to a sheet: see `scene.sheet_response`. */

@@ -47,9 +47,9 @@ class _Sheet(ctypes.Structure):
 
 class _Areas(ctypes.Structure):
     _fields_ = (
-        *_integers("triangles", "nodes", "layers", "rim", "near", "is_known"),
+        *_integers("triangles", "nodes", "layers", "rim", "is_known"),
         *_addresses("triangle", "corner", "node", "start", "depth", "layer"),
-        *_addresses("both", "bare"),
+        *_addresses("both", "rest"),
     )
 
 
@@ -142,7 +142,7 @@ class CompiledAreas:
         where: (p,) pressable nodes that they are around.
         found: the same for C.
         nodes: (n,) positions of their nodes in `BareSheet.support`.
-        rim, near: (r,) positions of those on rims, (m,) of those and of their neighbours.
+        rim: (r,) positions of those on rims.
     """
 
     def __init__(self, sheet: _Sheet, where: IntArray) -> None:
@@ -153,19 +153,18 @@ class CompiledAreas:
         self._kept = np.empty(sizes.sum(), np.int64)
         starts = (sizes.cumsum() - sizes).tolist()
         place = address(self._kept)
-        self.found = _Areas(0, 0, 0, 0, 0, 0, *(place + 8 * start for start in starts))
+        self.found = _Areas(0, 0, 0, 0, 0, *(place + 8 * start for start in starts))
         _check(
             LIBRARY.find_areas(ctypes.byref(sheet), len(where), at(where), ctypes.byref(self.found))
         )
         rim = self.found.rim
         count = self.found.nodes
         self.nodes = self._kept[starts[2] : starts[2] + count]
-        depth = self._kept[starts[4] : starts[4] + count]
-        self.rim, self.near = self.nodes[depth == 0], self.nodes[depth <= 1]
+        self.rim = self.nodes[self._kept[starts[4] : starts[4] + count] == 0]
         width = rim + sheet.fields
-        self._known = np.empty(2 * rim * width)
+        self._known = np.empty(rim * (width + rim))
         self.found.both = place = address(self._known)
-        self.found.bare = place + 8 * rim * width
+        self.found.rest = place + 8 * rim * width
 
 
 @dataclass(frozen=True)
@@ -239,7 +238,7 @@ class CompiledSheet:
         """Blocks of a Green's function that is in pieces, for C; None where C can look them up."""
         if isinstance(self._bare.green, PackedGreensFunction) or areas.found.is_known:
             return None
-        return np.ascontiguousarray(self._bare.green.between(areas.near, areas.rim))
+        return np.ascontiguousarray(self._bare.green.between(areas.rim, areas.rim))
 
     def solve(
         self,
