@@ -194,12 +194,7 @@ def _response_test(study: _Study, asked: set[int]) -> _Part:
 
 def _single_areas(study: _Study, asked: set[int]) -> _Part:
     from tactomo_lab.commands.paper_pictures import draw_images, draw_traces
-    from tactomo_lab.evaluation.paper import (
-        PAPER_MAGNITUDE_ERROR,
-        SINGLE,
-        magnitude_errors,
-        magnitude_estimates,
-    )
+    from tactomo_lab.evaluation.paper import PAPER_MAGNITUDE_ERROR, SINGLE, magnitude_errors
 
     frames = _image(study, SINGLE, "Figs. 8 and 9")
     errors = magnitude_errors(frames, study.description)
@@ -219,8 +214,14 @@ def _single_areas(study: _Study, asked: set[int]) -> _Part:
     facts = {
         "errors": [asdict(error) for error in errors],
         "estimates": [
-            {"method": method, "sheet": sheet, "case": case, "pressure_kpa": kpa, "value": value}
-            for (method, sheet, case, kpa), value in magnitude_estimates(frames).items()
+            {
+                "method": frame.method,
+                "sheet": frame.sheet,
+                "case": frame.case.number,
+                "pressure_kpa": frame.pressures_kpa[0],
+                "value": frame.estimate,
+            }
+            for frame in frames
         ],
         "paper_hardware": {
             method: {"error": error, "pressure_kpa": kpa}

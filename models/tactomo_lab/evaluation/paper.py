@@ -296,6 +296,11 @@ class Frame:
         blank = np.zeros_like(self.truth.map)
         return blank if self.made.map is None else self.made.map.astype(np.float64)
 
+    @property
+    def estimate(self) -> float:
+        """How hard the whole image says is pressed, see `magnitude_estimate`."""
+        return magnitude_estimate(self.image, self.method)
+
 
 def frames_of(cases: Sequence[Arrangement]) -> int:
     """How many presses the cases are."""
@@ -360,11 +365,10 @@ def magnitude_errors(
 def _magnitude_error(
     method: str, sheet: int, frames: Sequence[Frame], description: SensorDescription
 ) -> MagnitudeError:
-    full = full_range(description)
-    of_image, of_contact = magnitude_estimates(frames), contact_magnitudes(frames)
-    keys = [[(method, sheet, case.number, kpa) for kpa in CASE_KPA] for case in SINGLE]
-    image = np.array([[of_image[key] for key in row] for row in keys])  # (cases, pressures)
-    contact = np.array([[of_contact[key] for key in row] for row in keys])
+    full, grid = full_range(description), (len(SINGLE), len(CASE_KPA))  # frames come in that order
+    image = np.array([frame.estimate for frame in frames]).reshape(grid)
+    contacts = [largest_contact(frame.made.contacts) for frame in frames]
+    contact = np.array([c.magnitude if c else np.nan for c in contacts]).reshape(grid)
     spread = np.ptp(image, axis=0)
     worst = int(spread.argmax())
     largest = float(image.max()) or 1.0
@@ -377,24 +381,6 @@ def _magnitude_error(
         of_contacts=float(np.ptp(contact, axis=0).max()) / full,
         rises=float(np.mean((np.diff(image, axis=1) > 0).all(axis=1))),
     )
-
-
-Estimates = dict[tuple[str, int, int, float], float]  # by method, sensor, case and pressure
-
-
-def magnitude_estimates(frames: Iterable[Frame]) -> Estimates:
-    """What the images of single areas say, see `magnitude_estimate`."""
-    return {_key(frame): magnitude_estimate(frame.image, frame.method) for frame in frames}
-
-
-def contact_magnitudes(frames: Iterable[Frame]) -> Estimates:
-    """What the largest contact of each frame says; NaN where there is none, or it says nothing."""
-    found = {_key(frame): largest_contact(frame.made.contacts) for frame in frames}
-    return {key: contact.magnitude if contact else float("nan") for key, contact in found.items()}
-
-
-def _key(frame: Frame) -> tuple[str, int, int, float]:
-    return frame.method, frame.sheet, frame.case.number, frame.pressures_kpa[0]
 
 
 def largest_contact(contacts: Sequence[Contact]) -> Contact | None:
