@@ -24,7 +24,7 @@ EXTRA = (
     "see https://pytorch.org/get-started"
 )
 INTERRUPTED = 130
-TANKS_IN_SHARD = 250  # as many as a minute's work on a slow core
+FEWEST_TANKS = 250  # a shard of them
 
 # The models' CONFIGURATIONS, which are not imported for a command line that only shows its help.
 ConfigurationName: TypeAlias = Literal[
@@ -190,7 +190,7 @@ def train(
 )
 def train_tanks(
     folder: Annotated[Path, typer.Argument(help="Folder for the scenes; made if missing.")],
-    scenes: Annotated[int, typer.Option(min=TANKS_IN_SHARD, help="How many tanks.")] = 2500,
+    scenes: Annotated[int, typer.Option(min=FEWEST_TANKS, help="How many tanks.")] = 2500,
     steps: Annotated[int, typer.Option(min=20, help="Batches of twenty.")] = 3600,
     seed: Annotated[int, typer.Option(min=0, help="Seed of weights, noise and turns.")] = 0,
     jobs: Annotated[
@@ -208,23 +208,17 @@ def train_tanks(
     so. Needs `pip install 'tactomo-lab[train]'`.
     """
     with needs("training", EXTRA):
-        from joblib import Parallel, delayed
-
         from tactomo_lab.training.tank_network import train as train_network
-        from tactomo_lab.training.tank_scenes import write_shard
+        from tactomo_lab.training.tank_scenes import SHARD, simulate_shard
         from tactomo_lab.training.train import use
+        from tactomo_lab.training.training_scenes import make_shards
 
         use("cpu", jobs)
         folder.mkdir(parents=True, exist_ok=True)
-        shards = range(scenes // TANKS_IN_SHARD)
-        written = (
-            delayed(write_shard)(folder / f"tanks-{shard:03d}.npz", shard, TANKS_IN_SHARD)
-            for shard in shards
-        )
+        shards = [(first, SHARD) for first in range(0, scenes - SHARD + 1, SHARD)]
+        made = make_shards(folder, "tanks", shards, simulate_shard, jobs=jobs or -1)
+        _follow(made, len(shards) * SHARD, "tanks", folder)
         with _progress() as shown:
-            task = shown.add_task("simulating", total=len(shards))
-            for _ in Parallel(n_jobs=jobs or -1, return_as="generator")(written):
-                shown.advance(task)
             task = shown.add_task("training", total=steps)
             for loss in train_network(folder, steps, output, seed):
                 shown.update(task, advance=1, description=f"training, loss {loss:.4f}")

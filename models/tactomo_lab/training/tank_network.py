@@ -112,7 +112,7 @@ class TankScenes:
     """Scenes of a folder as batches.
 
     Args:
-        folder: of `tank_scenes.write_shard`.
+        folder: of shards by `tank_scenes.simulate_shard`.
         seed: of the choice, the turns and the noise.
     """
 

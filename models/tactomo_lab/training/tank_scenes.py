@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import islice
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
-from tactomo_models.archive import write_arrays
 from tactomo_models.arrays import FloatArray
 from tactomo_models.sensor.description_file import load_description
 
 from tactomo_lab.tanks.images import PIXELS, pixel_grid
 from tactomo_lab.tanks.model import TankModel
 
+SHARD = 250  # tanks in a file: a minute's work on a slow core
 TANKS = ("tank_ktc2023", "tank_uef2017")
 FINE_RINGS = 37  # of nodes: the mesh that inverts has 22
 FINE = 4 * PIXELS  # pixels in which outlines are drawn
@@ -104,18 +104,14 @@ def _outline(rng: np.random.Generator, x: FloatArray, y: FloatArray) -> FloatArr
             return (r < size) & (r > inner * size) & (np.abs(angle) < rng.uniform(0.8, 2.6))
 
 
-def write_shard(path: Path, shard: int, count: int) -> None:
-    """Write one file of scenes, of both tanks that ship; leave one that is there.
+def simulate_shard(first: int, size: int) -> dict[str, Any]:
+    """Simulate the `size` tanks of a shard that begins with tank `first`, as both that ship.
 
-    `change` (count, PIXELS, PIXELS) as `simulate` yields it; `tank_ktc2023` and `tank_uef2017`
-    (count, P) the changes of their transfer resistances.
+    `change` (size, PIXELS, PIXELS) as `simulate` yields it; `tank_ktc2023` and `tank_uef2017`
+    (size, P) the changes of their transfer resistances.
     """
-    if path.exists():
-        return
     models = [TankModel(load_description(name), FINE_RINGS) for name in TANKS]
-    kinds, solved = zip(*islice(simulate(models, shard), count), strict=True)
-    arrays = {
-        name: np.array(s, np.float32)
-        for name, s in zip(TANKS, zip(*solved, strict=True), strict=True)
-    }
-    write_arrays(path, {"change": np.array(kinds, np.float16), **arrays})
+    kinds, solved = zip(*islice(simulate(models, first // SHARD), size), strict=True)
+    by_tank = zip(TANKS, zip(*solved, strict=True), strict=True)
+    changes = {name: np.array(change, np.float32) for name, change in by_tank}
+    return {"change": np.array(kinds, np.float16), **changes}

@@ -127,6 +127,13 @@ def test_another_sensor_gets_scenes_of_its_own_size(
     assert 190 < max(flat) <= 200  # where its table ends
 
 
+def test_one_sheet_has_scenes_of_its_own(small: SensorDescription) -> None:
+    alone = variant(small, structure=None)
+    made = SceneSimulator(alone).simulate(draw_scene("robust", alone, 0, 1))
+    assert {name for name in made if name.endswith("_change")} == {"magnitude_change"}
+    assert made["map"].any()
+
+
 def test_a_sensor_without_a_magnitude_channel_is_refused() -> None:
     with pytest.raises(DataError, match=r"tank_disc.* has no magnitude channel.*another"):
         SceneSimulator(load_description("tank_disc"))

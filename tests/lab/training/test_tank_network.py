@@ -11,14 +11,15 @@ import torch
 from tactomo_lab.tanks.images import INPUTS, PIXELS, pixel_grid
 from tactomo_lab.tanks.model import TankModel
 from tactomo_lab.training.tank_network import TankScenes, _turned_grid, train, views
-from tactomo_lab.training.tank_scenes import write_shard
+from tactomo_lab.training.tank_scenes import simulate_shard
 from tactomo_models import load_description
+from tactomo_models.archive import write_arrays
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     found = tmp_path_factory.mktemp("scenes")
-    write_shard(found / "tanks-000.npz", 0, 3)
+    write_arrays(found / "tanks-0000000.npz", simulate_shard(0, 3))
     return found
 
 

@@ -32,6 +32,7 @@ from tactomo_lab.training.train import (
 )
 from tactomo_lab.training.training_scenes import simulate
 from tactomo_models import (
+    DataError,
     ModelError,
     SensorDescription,
     load_description,
@@ -43,6 +44,7 @@ from tactomo_models.methods.trained_networks import (
     load_network,
 )
 from tactomo_models.sensor.symmetry import symmetries
+from variants import variant
 
 pytestmark = pytest.mark.train
 Run = Callable[..., Any]
@@ -117,6 +119,20 @@ def test_a_training_that_was_broken_off_ends_with_the_same_network(
     assert str(resumed.history) == str(whole.history)  # means of no scenes are NaN
     assert_same_weights(resumed.network, whole.network)
     assert_same_weights(resumed.averaged, whole.averaged)
+
+
+def test_a_network_of_one_sheet_sees_that_sheet(
+    square: SensorDescription, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    alone = variant(square, structure=None)
+    folder = simulated("robust", 20, alone, tmp_path_factory)
+    prepared = prepare(replace(CONFIGURATIONS["ours"], width=6), folder, alone)
+    training = begun(prepared)
+    assert len(list(train(training, prepared.objective, replace(TINY, epochs=1)))) == 1
+    export_trained(prepared, training, file := folder / "network.onnx")
+    assert load_network(alone, "network", file).channels == ("magnitude",)
+    with pytest.raises(DataError, match="no structure channel"):
+        next(simulate(alone, "paper", folder / "paper", 20, jobs=1))
 
 
 def test_training_learns(ours: Prepared) -> None:
