@@ -111,6 +111,9 @@ def scenes(
     are simulated on another, finer mesh than the one that reconstructs. The first run simulates
     (half a second a scene) and keeps the voltages in the cache.
 
+    The sensor may have two sheets or one, of any outline. Without a magnitude channel the pressed
+    shape counts as the map.
+
     A frame whose *misfit*, in units of the scans' noise, is above 2 (1.5 over both channels, where
     an unsure network stands in) is flagged misfit_high; about 1 is good.
     """
@@ -280,7 +283,8 @@ def field(
     *overload*: one to three presses, the first or all beyond the response table's end. All are
     simulated as in `tactomo evaluate scenes`, still ones reconstructed from a cold start. The
     first run simulates (a second a scene, a minute a sequence, 10 s a palm) and keeps the voltages
-    in the cache.
+    in the cache. Rows that cannot happen to the sensor, as *overload* without a magnitude channel,
+    are left out.
     """
     from tactomo_models import ModelError, load_description
 
@@ -402,7 +406,8 @@ def stability(
     Noise, small contacts, many contacts, bad leads, drift, a stretched sheet, jumps and more: some
     simulated cases of each regime, reconstructed by every method. A map is bad where its ICC is
     below 0.7. What tells not to trust it: the flags misfit_high, not_converged, low_confidence,
-    reference_mismatch, noise_high and channels_swapped, or that there is no map. The first run
+    reference_mismatch, noise_high and channels_swapped, or that there is no map. Regimes that
+    cannot happen to the sensor, as lost structure scans to one sheet, are left out. The first run
     simulates (a second a case, some more where a case is several frames) and keeps the voltages
     in the cache.
     """

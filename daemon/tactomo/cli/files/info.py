@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tactomo.cli.options import JsonOutput, examples, typer_app
-from tactomo.cli.output import print_json
+from tactomo.cli.output import print_json, table
 
 if TYPE_CHECKING:
     from tactomo_models import SensorDescription
@@ -51,10 +51,10 @@ def info(
 
     from tactomo.cli.console import Console
 
-    table = Table(title=what, show_header=False)
+    shown = Table(title=what, show_header=False)
     for name, value in facts.items():
-        table.add_row(Text(name, "bold"), _words(value))
-    Console().print(table)
+        shown.add_row(Text(name, "bold"), _words(value))
+    Console().print(shown)
 
 
 def _show_folder(folder: Path, as_json: bool) -> None:
@@ -66,17 +66,13 @@ def _show_folder(folder: Path, as_json: bool) -> None:
     if as_json:
         print_json(rows)
         return
-    from rich.table import Table
-
     from tactomo.cli.console import Console
 
-    table = Table(title=str(folder))
-    for name in ("recording", "sensor", "began", "seconds", "MB", "ends"):
-        justify: Literal["right", "left"] = "right" if name in ("seconds", "MB") else "left"
-        table.add_column(name, justify=justify, no_wrap=name != "recording", overflow="fold")
+    columns = ("recording", "sensor", "began", "seconds", "MB", "ends")
+    listed = table(*columns, left=("sensor", "began", "ends"), title=str(folder))
     for row in rows:
-        table.add_row(*(str(value) for value in row.values()))
-    Console().print(table)
+        listed.add_row(*(str(value) for value in row.values()))
+    Console().print(listed)
 
 
 def _recording_line(path: Path) -> dict[str, Any]:
