@@ -562,8 +562,8 @@ def make_case(
     """
     if not can_happen(regime, description):
         raise DataError(
-            f"{regime!r} cannot happen to {description.name!r}, which has "
-            f"{' and '.join(description.channels)}: choose other regimes"
+            f"{regime!r} cannot happen to {description.name!r}, whose channels are: "
+            f"{', '.join(description.channels)}; choose other regimes"
         )
     description = REGIMES[regime].sensor_of(description)
     plan = draw_plan(description, regime, seed_set, number)
