@@ -6,9 +6,10 @@ Threads, each with what it alone touches, and what it hands on:
 thread        owns                        hands on
 ============  ==========================  =========================================================
 port-0, -1    a serial port               scans to the pipeline, bytes to the recorder
-pipeline      sync, the reconstructor     messages to the publisher, marks to the recorder
+pipeline      sync, the reconstructor     messages to the publisher; marks and, if that is asked
+                                          for, those messages to the recorder
 control       the control socket          commands to the pipeline and to the recorder
-publisher     the stream's socket         what it sent to the recorder, if that is asked for
+publisher     the stream's socket         nothing
 metrics       the scrapers' socket        nothing; only if it is asked for
 access        the list of clients         nothing; runs where there are keys (AccessControl)
 recorder      the files of recordings     nothing

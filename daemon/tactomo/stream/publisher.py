@@ -1,8 +1,8 @@
 """The publisher thread: the only one that touches the stream's socket.
 
-Other threads hand it messages by a queue and wake it through a pipe, so that it can wait for them
-and for subscriptions at once. It never waits for a subscriber: what does not fit into a slow one's
-queue is lost to that one alone.
+Whoever publishes encodes the message, has it recorded, and hands its bytes over by a queue; a pipe
+wakes the thread, so that it can wait for them and for subscriptions at once. It never waits for a
+subscriber: what does not fit into a slow one's queue is lost to that one alone.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import zmq
 from tactomo_client import MessageError
@@ -45,15 +45,10 @@ NO_FRAME_YET: Final[dict[str, Any]] = {
 }
 
 
-class _Outgoing(NamedTuple):
-    kind: str
-    sequence: int
-    header: Mapping[str, Any] | None  # None: the newest frame's
-    fields: Mapping[str, Any]
-
-
 class Publisher(Worker):
     """Numbers, stamps and sends messages; publishes the status every second, or when asked to.
+
+    Scans and frames are published by one thread, the pipeline's.
 
     `open` it, `start` its thread, `stop` it.
     """
@@ -64,17 +59,18 @@ class Publisher(Worker):
         session: str,  # identity of this run of the daemon
         # returns the current fields of a `status` message with that header; called by the thread
         status: Callable[[Mapping[str, Any]], Mapping[str, Any]],
-        # called by the thread with kind and bytes of each frame's message, before it is sent:
-        # whatever was seen is in the recording
+        # called with kind and bytes of each frame's message, before it is sent: whatever was seen
+        # is in the recording
         on_frame: Callable[[str, bytes], None],
         on_event: OnEvent,  # told of a flood of subscriptions, and of messages that cannot be sent
     ) -> None:
         super().__init__("publisher")
         self.address = ""  # where it is bound, once open
         self.subscribers = 0  # subscriptions in force
-        # that of the newest frame that could be sent; it goes with status and events, too
+        # that of the newest frame that could be sent; it goes with status and events, too. This
+        # and `latency` are written by the thread that publishes frames
         self.header: Mapping[str, Any] = NO_FRAME_YET
-        # from the last byte of a dual scan to the sending of its contacts
+        # from the last byte of a dual scan until its contacts are handed over
         self.latency = Durations()
         self._sensor = sensor
         self._session = session
@@ -87,7 +83,7 @@ class Publisher(Worker):
         self._cuts_seen = self._cuts_told = 0
         self._prefixes: frozenset[bytes] = frozenset()  # a copy for the other threads
         self._last_status = b""
-        self._queue: deque[_Outgoing] = deque(maxlen=MAX_QUEUED)
+        self._queue: deque[bytes] = deque(maxlen=MAX_QUEUED)
         self._cut = threading.Event()
         self._status_asked = threading.Event()
         self._socket: zmq.Socket[bytes]
@@ -132,7 +128,7 @@ class Publisher(Worker):
         header: Mapping[str, Any] | None = None,
     ) -> None:
         """Hand over a message; for any thread, and never waits."""
-        self._queue.append(self._number(kind, header, fields))
+        self._hand_over(kind, fields, self.header if header is None else header)
         if not self._stopping.is_set():
             self._wake()
 
@@ -140,13 +136,31 @@ class Publisher(Worker):
         """Return the envelope of the last message of a kind as of now; for any thread."""
         return self._stamp(self._sequence[kind], self.header)
 
-    def _number(
-        self, kind: str, header: Mapping[str, Any] | None, fields: Mapping[str, Any]
-    ) -> _Outgoing:
-        # Numbered when handed over: should the queue overflow, the gap shows.
-        with self._lock:
-            self._sequence[kind] += 1
-            return _Outgoing(kind, self._sequence[kind], header, fields)
+    def _hand_over(self, kind: str, fields: Mapping[str, Any], header: Mapping[str, Any]) -> bytes:
+        """Encode a message into the queue and return it; empty for one that breaks STREAM.md.
+
+        Its sequence number tells that it was left out, or lost to a queue that is full.
+        """
+        try:
+            with self._lock:  # messages of a kind are queued in the order of their numbers
+                self._sequence[kind] += 1
+                envelope = self._stamp(self._sequence[kind], header)
+                data = encode_message(self._sensor, kind, {**envelope, **fields})
+                if kind not in (STATUS, EVENT):
+                    self._on_frame(kind, data)
+                self._queue.append(data)
+        except MessageError as error:
+            self._on_event(
+                "message_unsent",
+                f"a {kind} message was left out: {error}",
+                "this is a mistake in tactomo: please report it with a recording",
+            )
+            return b""
+        if kind == CONTACTS:
+            self.header = header
+            if envelope["age_ns"] is not None:
+                self.latency.add((envelope["age_ns"] - envelope["delay_ns"]) * 1e-9)
+        return data
 
     def _stamp(self, sequence: int, header: Mapping[str, Any]) -> dict[str, Any]:
         acquired_ns = header["acquired_monotonic_ns"]
@@ -189,32 +203,12 @@ class Publisher(Worker):
 
     def _send_queued(self) -> None:
         while self._queue:
-            self._send(self._queue.popleft())
-
-    def _send(self, message: _Outgoing) -> bytes:
-        """Send a message; one that breaks STREAM.md is left out, and its sequence number tells."""
-        header = self.header if message.header is None else message.header
-        envelope = self._stamp(message.sequence, header)
-        try:
-            data = encode_message(self._sensor, message.kind, {**envelope, **message.fields})
-        except MessageError as error:
-            self._on_event(
-                "message_unsent",
-                f"a {message.kind} message was left out: {error}",
-                "this is a mistake in tactomo: please report it with a recording",
-            )
-            return b""
-        if message.kind == CONTACTS:
-            self.header = header
-        if message.kind not in (STATUS, EVENT):
-            self._on_frame(message.kind, data)
-        self._socket.send(data, zmq.DONTWAIT)
-        if message.kind == CONTACTS and envelope["age_ns"] is not None:
-            self.latency.add((envelope["age_ns"] - envelope["delay_ns"]) * 1e-9)
-        return data
+            self._socket.send(self._queue.popleft(), zmq.DONTWAIT)
 
     def _send_status(self) -> None:
-        self._last_status = self._send(self._number(STATUS, None, self._status(self.header)))
+        header = self.header
+        self._last_status = self._hand_over(STATUS, self._status(header), header)
+        self._send_queued()
 
     def _tell_cuts(self) -> None:
         """Tell that subscribers were cut off, a second later: then they are back to hear it."""
