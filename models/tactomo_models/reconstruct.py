@@ -28,7 +28,7 @@ from tactomo_models.physics.artifact import Artifact
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scans.reference import Reference
-from tactomo_models.scans.repeats import Repeats, is_noisy
+from tactomo_models.scans.repeats import Repeats
 from tactomo_models.scans.tare import Tare
 from tactomo_models.scene.areas import Areas
 from tactomo_models.scene.contacts import contacts_of, mounted, pressure_map, total_force
@@ -87,7 +87,6 @@ class Reconstructor:
         self._skin = replace(skin, regularisation=description.instrument.regularisation)
         self._tare = skin.tare
         self._repeats = Repeats(description.pairs)
-        self._last: dict[Channel, FloatArray] = {}  # scan of each channel
         self._methods: dict[str, Method] = {}  # by their names, once they were asked for
         self._failures: dict[str, str] = {}  # of methods prepared since the tare; empty if good
         self._previous: Estimate | None = None
@@ -224,14 +223,10 @@ class Reconstructor:
 
     def _measured(self, channel: Channel, scan: FloatArray | None) -> FloatArray | None:
         """A scan less the drives and pairs that repeat the last one; all of it may come again."""
-        last = self._last.get(channel)
         if scan is None or scan.shape != (self.description.measurements,):
             return scan
-        self._last[channel] = scan
-        if last is None or not is_noisy(self._tare.reference, channel, scan):
-            return scan
-        parts, repeated = self._repeats.find(scan, last)
-        return np.where(repeated, np.nan, scan) if parts else scan
+        found = self._repeats.find(channel, scan, self._tare.reference)
+        return scan if found is None or not found.parts else np.where(found.voltages, np.nan, scan)
 
     def solve(self, measurement: Measurement) -> Reconstruction:
         """The second half of `reconstruct`: what follows from a measurement."""

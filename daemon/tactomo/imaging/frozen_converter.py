@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from tactomo_models import Reference
-from tactomo_models.scans.repeats import Repeats, is_noisy
+from tactomo_models.scans.repeats import Repeats
 from tactomo_models.sensor.pattern import Pairs
 
 from tactomo.events import OnEvent
@@ -21,7 +21,6 @@ class FrozenConverters:
     def __init__(self, pairs: Pairs, on_event: OnEvent) -> None:
         self._on_event = on_event
         self._repeats = Repeats(pairs)
-        self._last: Volts = {}
 
     def without(self, volts: Volts, reference: Reference | None) -> Volts:
         """What was measured of a dual scan; told when that changes for a channel.
@@ -30,11 +29,11 @@ class FrozenConverters:
         """
         measured: Volts = {}
         for channel, scan in volts.items():
-            last = self._last.get(channel)
-            if last is None or not is_noisy(reference, channel, scan):
+            found = self._repeats.find(channel, scan, reference)
+            if found is None:
                 measured[channel] = scan
                 continue
-            parts, repeated = self._repeats.find(scan, last)
+            parts, repeated = found
             if repeated.any():
                 what = f"{channel} {', '.join(parts) or 'scans'}"
                 self._on_event(
@@ -48,5 +47,4 @@ class FrozenConverters:
                 self._on_event("converter_back", f"{channel} scans are measured again", "", channel)
             if not repeated.all():
                 measured[channel] = np.where(repeated, np.nan, scan)
-        self._last = self._last | volts
         return measured

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from tactomo_protocol import Channel
 
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.scans.frame_noise import FALSE_ALARM
@@ -25,7 +26,7 @@ class Repeated(NamedTuple):
 
 
 class Repeats:
-    """Finds what scans of one sensor's pattern repeat."""
+    """Finds what scans of one sensor's pattern repeat, one after another."""
 
     def __init__(self, pairs: Pairs) -> None:
         parts = {
@@ -35,12 +36,19 @@ class Repeats:
         }
         self._names, self._parts = np.array(list(parts)), np.array(list(parts.values()))
         self._sizes = self._parts.sum(axis=1)
+        self._last: dict[Channel, FloatArray] = {}
 
-    def find(self, scan: FloatArray, last: FloatArray) -> Repeated:
-        """What a noisy scan (M,) repeats of the last one: all of it, or drives and pairs.
+    def find(
+        self, channel: Channel, scan: FloatArray, reference: Reference | None
+    ) -> Repeated | None:
+        """What a scan (M,) repeats of its channel's last one: all of it, or drives and pairs.
 
         Coarse counts repeat by chance: as often as those beside the drives and pairs in question.
+        None where nothing can be told: of the first scan, and of those without noise at the tare.
         """
+        last, self._last[channel] = self._last.get(channel), scan
+        if last is None or not _is_noisy(reference, channel, scan):
+            return None
         same = scan == last
         if same.all():
             return Repeated((), same)
@@ -51,7 +59,7 @@ class Repeats:
         return Repeated(tuple(self._names[whole].tolist()), self._parts[whole].any(axis=0))
 
 
-def is_noisy(reference: Reference | None, channel: str, scan: FloatArray) -> bool:
+def _is_noisy(reference: Reference | None, channel: Channel, scan: FloatArray) -> bool:
     """Whether scans at rest differed in most voltages, by more than a mean of equals rounds."""
     noise: Any = getattr(reference, f"{channel}_noise", None)
     if reference is None or not reference.is_noise_measured or noise is None:
