@@ -11,7 +11,7 @@ import typer
 from tactomo.cli import options
 from tactomo.cli.output import say, table
 from tactomo.cli.plot.plot import picture_option
-from tactomo.cli.sensors import find_sensor, name_of
+from tactomo.cli.sensors import find_sensor, name_of, newest_status
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -77,12 +77,15 @@ def live(
     Says what to press, waits until the contact is still, asks for the load cell's reading, and says
     when there are enough. Ctrl-C keeps what was taken; the same command goes on from there.
     """
+    from tactomo_client.control import to_status
+
     from tactomo.cli.calibrate.live import guided
     from tactomo.cli.calibrate.reload import keep
 
     found = find_sensor(sensor, address, keys)
+    status = to_status(newest_status(found.sensor, address, keys))
     path, area = _path(found.sensor, output), _area_mm2(diameter_mm, area_mm2)
-    made = guided(found.sensor, found.stream, keys, area, path, fresh=fresh)
+    made = guided(status, found.stream, keys, area, path, fresh=fresh)
     print_calibration(made)
     keep(made, path, address, keys)
 

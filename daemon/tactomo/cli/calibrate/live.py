@@ -56,12 +56,18 @@ class Held:
 
 
 def guided(
-    sensor: str, stream: str, keys: Path | None, area_mm2: float | None, path: Path, *, fresh: bool
+    status: Status,
+    stream: str,
+    keys: Path | None,
+    area_mm2: float | None,
+    path: Path,
+    *,
+    fresh: bool,
 ) -> PressureCalibration:
-    """Take readings together with the user, and fit them.
+    """Take readings together with the user, and fit them; `status` is the daemon's.
 
     Raises:
-        TactomoError: no daemon answers, or the sensor has no magnitude channel.
+        TactomoError: the sensor has no magnitude channel.
         CalibrationError: what was taken makes no curve yet.
     """
     from tactomo_models.calibration.calibration_file import SUFFIX, PressureCalibration
@@ -70,14 +76,14 @@ def guided(
 
     console = Console(highlight=False, soft_wrap=True)
     log = path.with_name(path.name.removesuffix(SUFFIX) + ".readings.csv")
-    view = View(sensor, stream, keys)
+    subject = _subject(status)
+    view = View(status.sensor, stream, keys)
     try:
-        status = _first_status(view)
         session = _Session(view, console, status, area_mm2, log, fresh=fresh)
         session.run()
     finally:
         view.close()
-    return PressureCalibration.of_readings(_subject(sensor, status), session.readings)
+    return PressureCalibration.of_readings(subject, session.readings)
 
 
 def distrusted(frame: Frame) -> frozenset[str]:
@@ -87,34 +93,19 @@ def distrusted(frame: Frame) -> frozenset[str]:
     return frame.flags & frozenset(DISTRUST.names())
 
 
-def _first_status(view: View) -> Status:
-    """Return the daemon's status; TactomoError where no daemon can measure a magnitude."""
-    from tactomo_client.schema import STALE_AFTER_S
-
-    end_s = time.monotonic() + STALE_AFTER_S
-    while view.status is None and time.monotonic() < end_s:
-        view.update(0.1)
-    if view.status is None or view.status.description is None:
-        raise TactomoError(
-            f"no daemon answers at {view.stream} for a sensor {view.sensor!r}",
-            "`tactomo status` says how it is",
-        )
-    if "magnitude" not in view.status.description.modalities:
-        raise TactomoError(
-            f"{view.sensor} has no magnitude channel",
-            "its structure channel tells where it is touched, and never how hard",
-        )
-    return view.status
-
-
-def _subject(sensor: str, status: Status) -> Subject:
+def _subject(status: Status) -> Subject:
+    """Return what is calibrated; TactomoError for a sensor that measures no magnitude."""
     from tactomo_models.calibration.calibration_file import Subject
 
     description = status.description
-    assert description is not None
+    if description is None or "magnitude" not in description.modalities:
+        raise TactomoError(
+            f"{status.sensor} has no magnitude channel",
+            "its structure channel tells where it is touched, and never how hard",
+        )
     devices = {port.device.device_id for port in status.ports if port.device is not None}
     return Subject(
-        sensor=sensor,
+        sensor=status.sensor,
         description=description.model,
         sha256=description.sha256,
         device_ids=tuple(sorted(devices)),
