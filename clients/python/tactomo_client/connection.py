@@ -11,15 +11,15 @@ import contextlib
 import ipaddress
 import time
 import weakref
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Iterator
 from typing import Any, Final, TypeVar
 from urllib.parse import urlsplit
 
 import zmq
 
-from tactomo_client.errors import ControlError, KeysError
+from tactomo_client.errors import ControlError, KeysError, MessageError
 from tactomo_client.keys import Handshakes, Keys, secure
-from tactomo_client.messages import MAX_MESSAGE_BYTES
+from tactomo_client.messages import MAX_MESSAGE_BYTES, Message, decode_message
 
 KNOCK_PERIOD_S: Final = 1.0  #: how often a client that was not let in tries again
 
@@ -111,6 +111,23 @@ class Connection:
             return self.socket.recv(zmq.NOBLOCK)
         except zmq.Again:
             return None
+
+    def heard(self, wait_s: float) -> Iterator[Message]:
+        """Yield the messages that have come, after a wait for the first, but malformed ones.
+
+        Raises:
+            KeysError: the server does not let this client in.
+        """
+        wait_ms = round(wait_s * 1e3)
+        while self.socket.poll(wait_ms):
+            wait_ms = 0
+            try:
+                message = decode_message(self.socket.recv())
+            except MessageError:
+                continue
+            yield message
+        if refusal := self.refusal():
+            raise refusal
 
     def refusal(self) -> KeysError | None:
         """Return why the server lets nobody in by these keys; None as long as it may do so."""

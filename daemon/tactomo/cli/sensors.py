@@ -157,10 +157,9 @@ def _from_here(control: str, stream: str) -> str:
 def _statuses(name: str | None, address: str, keys: Path | None) -> Mapping[str, Mapping[str, Any]]:
     """Return the newest status of each sensor that a stream carries, or of the named one."""
     import zmq
-    from tactomo_client import MessageError
     from tactomo_client.connection import connect_subscriber
     from tactomo_client.keys import as_keys
-    from tactomo_client.messages import STATUS, decode_message, topic
+    from tactomo_client.messages import STATUS, topic
     from tactomo_client.schema import STALE_AFTER_S
 
     heard: dict[str, Mapping[str, Any]] = {}
@@ -171,18 +170,11 @@ def _statuses(name: str | None, address: str, keys: Path | None) -> Mapping[str,
     end_s = time.monotonic() + STALE_AFTER_S
     try:
         while (left_s := end_s - time.monotonic()) > 0 and not (name and heard):
-            if not socket.poll(round(min(left_s, 0.1) * 1e3)):
-                if refusal := connection.refusal():
-                    raise refusal
-                continue
-            try:
-                message = decode_message(socket.recv())
-            except MessageError:
-                continue
-            if not heard:
-                end_s = min(end_s, time.monotonic() + ALL_S)
-            if message.kind == STATUS:
-                heard[message.sensor] = message.fields
+            for message in connection.heard(min(left_s, 0.1)):
+                if not heard:
+                    end_s = min(end_s, time.monotonic() + ALL_S)
+                if message.kind == STATUS:
+                    heard[message.sensor] = message.fields
     finally:
         connection.close()
     return heard

@@ -131,8 +131,8 @@ class _Listener:
         self.said: dict[str, list[dict[str, Any]]] = {MAP: [], SCAN: [], STATUS: []}
         self._where = f"{stream} for a sensor {sensor!r}"
         topics = [topic(sensor, kind) for kind in self.said]
-        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
-        self._connection = connect_subscriber(self._socket, stream, topics, keys=keys)
+        socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
+        self._connection = connect_subscriber(socket, stream, topics, keys=keys)
 
     def first_status(self) -> dict[str, Any]:
         """Wait for a status and forget what came before it; DoctorError where there is none."""
@@ -150,18 +150,8 @@ class _Listener:
 
     def listen(self, wait_s: float) -> None:
         """Take in what comes, waiting for it at most `wait_s`."""
-        from tactomo_client import MessageError
-        from tactomo_client.messages import decode_message
-
-        while self._socket.poll(round(wait_s * 1e3)):
-            wait_s = 0.0
-            try:
-                message = decode_message(self._socket.recv())
-            except MessageError:
-                continue
+        for message in self._connection.heard(wait_s):
             self.said[message.kind].append(message.fields)
-        if refusal := self._connection.refusal():
-            raise refusal
 
     def close(self) -> None:
         """Close the subscription."""

@@ -9,14 +9,13 @@ from typing import IO, Any, Final
 
 import numpy as np
 from tactomo_client import Contact, Frame
-from tactomo_models import Flag
+from tactomo_models import Flag, batch
 from tactomo_models.arrays import FloatArray
 from tactomo_models.growing_arrays import GrowingArrays
 
 from tactomo.cli.files.csv import ARRAY_COLUMNS
 from tactomo.cli.files.recorded_frames import Moment
 
-IMAGES: Final = ("map", "pressure_kpa", "structure")
 FRAME_TYPES: Final[Mapping[str, str]] = {
     "time_s": "<f8",
     "acquired_realtime_ns": "<i8",
@@ -29,23 +28,8 @@ FRAME_TYPES: Final[Mapping[str, str]] = {
     "force_sigma_n": "<f8",
     "flags": "<u4",
 }
-CONTACT_TYPES: Final[Mapping[str, str]] = {
-    "contact_frame": "<i8",
-    **{
-        ARRAY_COLUMNS.get(field.name, f"contact_{field.name}"): {
-            "int": "<i8",
-            "str": "<U8",
-            "bool": "?",
-            "str | None": "<U63",
-        }.get(str(field.type), "<f8")
-        for field in fields(Contact)
-    },
-}
-
-ROWS: Final[Mapping[str, tuple[int, ...]]] = {
-    **dict.fromkeys(CONTACT_TYPES, ()),
-    **dict.fromkeys(("contact_position_m", "contact_normal"), (3,)),
-}
+CONTACT_TYPES: Final[Mapping[str, Any]] = {"contact_id": "<i8", **batch.CONTACT_TYPES}
+ROWS: Final[Mapping[str, tuple[int, ...]]] = {**dict.fromkeys(CONTACT_TYPES, ()), **batch.VECTORS}
 
 
 def write_maps(
@@ -57,7 +41,7 @@ def write_maps(
 
     An image that a frame does not have, and a number that is not known, is NaN.
     """
-    types = {**FRAME_TYPES, **CONTACT_TYPES, **dict.fromkeys(IMAGES, "<f4")}
+    types = {**FRAME_TYPES, **CONTACT_TYPES, **dict.fromkeys(batch.IMAGES, "<f4")}
     axes: dict[str, FloatArray] = {}
     count = 0
     with GrowingArrays(types, scratch) as arrays:
@@ -68,7 +52,7 @@ def write_maps(
             axes = axes or _axes(moment.frame)
             count += 1
         shape = (len(axes["y_mm"]), len(axes["x_mm"])) if axes else None
-        shapes = {**ROWS, **(dict.fromkeys(IMAGES, shape) if shape else {})}
+        shapes = {**ROWS, **(dict.fromkeys(batch.IMAGES, shape) if shape else {})}
         arrays.write(output, shapes, **axes)
     return count
 
@@ -79,7 +63,7 @@ def _frame_values(moment: Moment) -> dict[str, Any]:
     bits = sum(Flag[name] for flag in frame.flags if (name := flag.upper()) in Flag.__members__)
     return {
         **known,
-        **{name: getattr(frame, name) for name in IMAGES},
+        **{name: getattr(frame, name) for name in batch.IMAGES},
         "time_s": time_s,
         "age_s": _known(age_s),
         "tier": frame.tier or "",
@@ -101,7 +85,7 @@ def _known(value: Any) -> Any:
 
 def _axes(frame: Frame) -> dict[str, FloatArray]:
     """Return the positions of the images' columns and rows, mm; nothing for a frame without one."""
-    image = next((i for name in IMAGES if (i := getattr(frame, name)) is not None), None)
+    image = next((i for name in batch.IMAGES if (i := getattr(frame, name)) is not None), None)
     if image is None or frame.x_mm is None or frame.y_mm is None:
         return {}
     rows, columns = image.shape
