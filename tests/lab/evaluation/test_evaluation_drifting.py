@@ -36,13 +36,14 @@ def test_an_hour_of_drift_leaves_no_ghost_and_erases_nothing(paper: SensorDescri
 @pytest.mark.timeout(7200)
 def test_a_day_of_drift_leaves_no_ghost_and_erases_nothing(paper: SensorDescription) -> None:
     """Some minutes."""
-    day = draw_day(paper, "tuning", 0)
+    day = draw_day(paper, "reporting", 1)
     tracked = summarise_day(list(live(day)), day.hours)
     assert tracked.missed == tracked.erased == 0
     assert tracked.ghosts_per_hour == 0
-    untracked = summarise_day(list(live(day, track=False, every=20)), day.hours)
-    assert untracked.ghost_share > 0.3
-    assert untracked.magnitude_error > 2 * tracked.magnitude_error
+    untracked = summarise_day(list(live(day, track=False, every=10)), day.hours)
+    assert untracked.distrusted > 0.3
+    assert tracked.distrusted < 0.01
+    assert untracked.magnitude_error > tracked.magnitude_error
 
 
 def test_what_a_summary_counts() -> None:
