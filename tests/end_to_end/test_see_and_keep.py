@@ -11,8 +11,9 @@ from newcomer import Newcomer
 from page import Page
 from recorded_grasp import LAST_PRESSED, contacts_of, write_grasp
 from tactomo.cli.files.csv import CONTACT_COLUMNS, FRAME_COLUMNS
-from tactomo.cli.files.npz import CONTACT_TYPES, FRAME_TYPES, IMAGES
+from tactomo.cli.files.npz import CONTACT_TYPES, FRAME_TYPES
 from tactomo_foxglove.topics import FRAME_SCHEMA, HEALTH_SCHEMA
+from tactomo_models.batch import IMAGES
 from whole_system import repository
 
 PAGE = Page("docs/see_and_keep.md")
