@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from measured import measured
-from pressed import contact, contacts, described
+from pressed import contact, contacts, described, with_free
 from small_sensor import SMALL
 from tactomo_models import Channel, SensorDescription, inner_loop
 from tactomo_models.physics.bare_sheet import solve_bare_sheet
@@ -54,12 +54,12 @@ def run(fit: FieldFit) -> None:
     for each in (one for one in SCENES for _ in range(3)):
         each = each.copy()
         each[:, [X, Y, SIZE]] += 0.05 * rng.normal(size=(len(each), 3))
-        field = empty.of(each).with_free(slice(HARMONIC, HOLE + 1))
+        field = with_free(empty.of(each), slice(HARMONIC, HOLE + 1))
         fitted = fit.evaluate(field, field.join(each), fit.likely, data)
         assert np.isfinite(fit.jacobian(fitted, data)).all()
         field.sampled(each, field.x_m, field.y_m, 1e-3)
         for k in range(len(each)):
-            others = empty.of(np.delete(each, k, axis=0)).with_free(slice(PEAK, HOLE))
+            others = with_free(empty.of(np.delete(each, k, axis=0)), slice(PEAK, HOLE))
             fewer = others.draw(others.join(others.fixed))
             [step] = fit.steps_to(fitted, [fewer], data)
             assert all(np.isfinite(one).all() for one in vars(step).values())

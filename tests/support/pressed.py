@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -142,3 +142,10 @@ def described(small: SensorDescription, name: str) -> SensorDescription:
     return variant(
         small, magnitude={"response": magnitude} if magnitude else None, structure=structure
     )
+
+
+def with_free(field: PressureField, columns: slice) -> PressureField:
+    """The same contacts with some parameters of each fitted as well."""
+    free = field.free.copy()
+    free[:, columns] = True
+    return replace(field, free=free)

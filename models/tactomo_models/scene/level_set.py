@@ -68,18 +68,12 @@ class LevelSet:
             owned.prior_precision = np.append(self.prior_precision[:kernels], peaks**-2)
         return owned
 
-    def parameters_of(self, likeness: FloatArray, peaks: FloatArray | None = None) -> FloatArray:
-        """Parameters for an image (P,) that is 0 where nothing presses and 1 in contacts.
-
-        Args:
-            likeness: the image.
-            peaks: (K,) pressures of the contacts that own its parts, in the field's unit.
-        """
+    def parameters_of(self, likeness: FloatArray) -> FloatArray:
+        """Coefficients (K,) for an image (P,) that is 0 where nothing presses and 1 in contacts."""
         f = np.clip(2 * likeness - 1, RESTING, -RESTING)
         mu = self._projection @ (f - RESTING)
         # Gaussians round off small contacts; a start that presses nothing has no derivative.
-        mu = mu * (-2 * RESTING / max(float((self.kernels @ mu).max()), 1e-6))
-        return mu if self._field is None or peaks is None else np.append(mu, peaks)
+        return np.asarray(mu * (-2 * RESTING / max(float((self.kernels @ mu).max()), 1e-6)))
 
     def bounded(self, parameters: FloatArray) -> FloatArray:
         """Any coefficients will do; pressures stay in their range."""

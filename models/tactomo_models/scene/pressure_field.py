@@ -148,12 +148,6 @@ class PressureField:
         free[:, HARMONIC:PEAK] = modulated[:, None]
         return replace(self, fixed=fixed, free=free)
 
-    def with_free(self, columns: slice) -> PressureField:
-        """The same contacts with some parameters of each free as well."""
-        free = self.free.copy()
-        free[:, columns] = True
-        return replace(self, free=free)
-
     def with_peaks_alone(self, parameters: FloatArray) -> PressureField:
         """Contacts of these parameters, of which nothing but the peaks is fitted any more."""
         free = np.zeros_like(self.free)

@@ -153,7 +153,7 @@ def test_a_level_set_has_its_account(sensor: Sensor) -> None:
     centre = np.array([[0.003, -0.002]])
     level_set = LevelSet(sensor.fit.forward).owned_by(centre, sensor.field)
     off = np.hypot(sensor.field.x_m - 0.003, sensor.field.y_m + 0.002)
-    parameters = level_set.parameters_of(np.clip(1 - off / 0.02, 0, 1), np.array([PEAK_SHARE]))
+    parameters = np.append(level_set.parameters_of(np.clip(1 - off / 0.02, 0, 1)), PEAK_SHARE)
     field = sensor.fit.evaluate(level_set, parameters, sensor.fit.likely, sensor.no_data())
     assert field is not None
     data = data_of(sensor.changes(field), 0.003)

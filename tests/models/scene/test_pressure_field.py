@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pressed import contact, contacts
+from pressed import contact, contacts, with_free
 from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.forward import ForwardModel
@@ -105,7 +105,7 @@ def test_what_is_not_fitted_yet_passes_it_too(
 ) -> None:
     """The data are asked for an edge, a hole or bulges by these slopes, before any is fitted."""
     each = SCENES[name]
-    drawn = field.of(each).with_free(FURTHER[further])
+    drawn = with_free(field.of(each), FURTHER[further])
     parameters = drawn.join(each)
     direction = np.random.default_rng(4).standard_normal(len(parameters))
     assert orders_of(drawn, parameters, direction) == pytest.approx(2, abs=0.1)
@@ -119,7 +119,7 @@ def test_a_level_set_passes_a_taylor_test(
     level_set = LevelSet(forward).owned_by(centres, field if peaks else None)
     x, y = field.x_m, field.y_m
     near = np.hypot(x - centres[:, :1], y - centres[:, 1:]).min(axis=0)
-    parameters = level_set.parameters_of(np.clip(1 - near / 0.016, 0, 1), np.array([0.6, 0.9]))
+    parameters = np.append(level_set.parameters_of(np.clip(1 - near / 0.016, 0, 1)), [0.6, 0.9])
     direction = np.random.default_rng(5).standard_normal(len(parameters))
     count, unit = len(x), field.unit_kpa if peaks else level_set.draw(parameters).pressure_kpa[0]
     slope = slope_on_nodes(level_set.draw(parameters), direction, count, unit)
