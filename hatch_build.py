@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,8 @@ class CompileInnerLoop(BuildHookInterface):  # type: ignore[type-arg]
         if not compiler:
             self.app.abort(f"tactomo needs a C compiler to be built: {NEXT_STEP}")
         flags = ("-O3", "-std=c11", "-Wall", "-Wextra", "-fPIC", "-shared")
-        command = [*compiler, *flags, SOURCE, "-o", LIBRARY, "-lm"]
+        source = sha256((root / SOURCE).read_bytes()).hexdigest()
+        command = [*compiler, *flags, f'-DSOURCE="{source}"', SOURCE, "-o", LIBRARY, "-lm"]
         try:
             subprocess.run(command, cwd=root, check=True)
         except (OSError, subprocess.CalledProcessError) as error:

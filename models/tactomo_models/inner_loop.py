@@ -6,6 +6,7 @@ BLAS and LAPACK are SciPy's own, by the addresses that it gives to Cython.
 from __future__ import annotations
 
 import ctypes
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from tactomo_models.errors import ModelError
 
 _PATH = Path(__file__).with_name("libinner_loop.so")
+_SOURCE = Path(__file__).with_name("inner_loop.c")
 _ROUTINES = {
     scipy.linalg.cython_blas: ("dgemm", "dtrsm"),
     scipy.linalg.cython_lapack: ("dpotrf", "dgetrf", "dgetrs"),
@@ -55,7 +57,10 @@ def _functions(path: Path) -> dict[str, Any]:
     try:
         library = ctypes.CDLL(str(path))
         functions = {name: getattr(library, name) for name in _ARGUMENTS}
-    except (OSError, AttributeError) as error:
+        built_from = (ctypes.c_char * 65).in_dll(library, "source").value.decode()
+        if built_from not in ("", sha256(_SOURCE.read_bytes()).hexdigest()):
+            raise OSError(f"{_SOURCE.name} has changed since it was compiled")
+    except (OSError, AttributeError, ValueError) as error:
         state = "is not of this machine and version" if path.exists() else "is missing"
         raise ModelError(
             f"the compiled inner loop {state} ({error}); install tactomo again, with a C compiler "

@@ -36,3 +36,16 @@ def test_a_library_that_cannot_be_used_says_what_to_do(
         monkeypatch.delattr(LIBRARY, name)  # as in a process that has not used it yet
     with pytest.raises(ModelError, match=f"{state}.*install tactomo again"):
         ForwardModel(forward.description, forward.bare)
+
+
+def test_a_library_of_another_source_is_not_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forward: ForwardModel
+) -> None:
+    """Its arrays may lie elsewhere: the process would die without a word."""
+    newer = tmp_path / "inner_loop.c"
+    newer.write_text("/* changed since */")
+    monkeypatch.setattr(inner_loop, "_SOURCE", newer)
+    for name in [*vars(LIBRARY)]:
+        monkeypatch.delattr(LIBRARY, name)
+    with pytest.raises(ModelError, match=r"has changed since.*install tactomo again"):
+        ForwardModel(forward.description, forward.bare)
