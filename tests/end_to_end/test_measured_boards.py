@@ -23,10 +23,10 @@ from tactomo_client import Frame, subscribe
 from tactomo_lab.evaluation.skin_presses import read_presses
 from tactomo_lab.evaluation.tanks import (
     TankImager,
-    correlation,
     on_pixels,
     read_tanks,
 )
+from tactomo_lab.scenes.measures import correlation
 from tactomo_models import Artifact, SensorDescription, build_artifact, load_description
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.physics.forward import ForwardModel
