@@ -941,6 +941,22 @@ def test_a_replay_is_steered_by_the_page(page: Page) -> None:
     wait_until(lambda: page.daemon.requests == [("replay", each) for each in asked])
 
 
+def test_a_move_is_over_where_its_frame_comes_before_its_reply(page: Page) -> None:
+    """They come by different sockets; a paused replay sends no second frame."""
+    page.open()
+    is_moving = page.browser.execute_async_script("""
+        const done = arguments[0];
+        import('/replay.js').then(async ({ Replay }) => {
+          const replay = new Replay(async () => replay.noteFrame());
+          replay.fields = { paused: true };
+          document.getElementById('position').dispatchEvent(new Event('input'));
+          const isBegun = replay.isMoving;
+          await new Promise((soon) => setTimeout(soon));
+          done([isBegun, replay.isMoving]);
+        })""")
+    assert is_moving == [True, False]
+
+
 def test_a_replay_that_waits_for_the_page_begins_when_its_first_frame_is_seen(page: Page) -> None:
     page.daemon.answers["replay"] = REPLAY
     waiting = REPLAY | {"paused": True, "waits_for_page": True}

@@ -10,6 +10,7 @@ export class Replay {
     this.fields = null;
     this.moves = null;  // where it is to go on, until that is asked for
     this.isMoving = false;  // whether the map is still that of before
+    this.hasFrame = false;  // whether one has come since the daemon was asked to move
     byId("play").onclick = () => this.#ask(
       this.#hasEnded ? { position_s: 0, paused: false } : { paused: !this.fields.paused });
     byId("step").onclick = () => this.#ask({ step: true });
@@ -56,6 +57,7 @@ export class Replay {
 
   /** Take note of a new frame. */
   noteFrame() {
+    this.hasFrame = true;
     if (this.moves === null) this.isMoving = false;
   }
 
@@ -67,9 +69,12 @@ export class Replay {
     if (isUnderWay) return;
     for (let asked = null; asked !== this.moves;) {
       asked = this.moves;
+      this.hasFrame = false;
       await this.#ask({ position_s: asked });
     }
     this.moves = null;
+    // The frame may come before the reply, and a paused replay sends no other one.
+    if (this.hasFrame && this.fields.paused) this.isMoving = false;
   }
 
   get #hasEnded() {
