@@ -10,6 +10,8 @@ ModelError
                         ("unknown method 'tikonov'; use one of: auto, tikhonov, ...")
 """
 
+import re
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -40,6 +42,18 @@ class MethodError(ModelError):
     """A reconstruction method that there is not, or that the sensor cannot do."""
 
 
+def explain_all(items: Iterable["ErrorDetails"]) -> list[str]:
+    """The same of all complaints, but of a list of numbers only the first, and how many follow."""
+    of_lists: dict[str, list[ErrorDetails]] = {}
+    for item in items:
+        key = ".".join(map(str, item["loc"]))
+        of_lists.setdefault(re.sub(r"(\.\d+)+$", "", key), []).append(item)
+    return [
+        explain(first) + (f" (and {len(more)} more of this list)" if more else "")
+        for first, *more in of_lists.values()
+    ]
+
+
 def explain(item: "ErrorDetails") -> str:
     """Turn one of pydantic's complaints about a file into "key = value: what is allowed"."""
     key = _short(
@@ -59,7 +73,8 @@ def explain(item: "ErrorDetails") -> str:
         return message
     if isinstance(item["input"], dict):  # from a section's own check: its text opens with the key
         return f"{key}.{message}"
-    if key.endswith("_m") and item["type"].startswith("less_than"):  # lengths are in metres
+    is_beyond = item["type"].startswith(("less_than", "greater_than"))
+    if re.search(r"_m(\.\d+)*$", key) and is_beyond and abs(item["input"]) > 1:  # in metres
         message += f"; in millimetres? {item['input']:g} mm are {item['input'] * 1e-3:g} m"
     return f"{key} = {given}: {message}"
 

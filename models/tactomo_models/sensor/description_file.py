@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from tactomo_models.errors import DescriptionError, explain
+from tactomo_models.errors import DescriptionError, explain_all
 from tactomo_models.foreign_file import MAX_TEXT_BYTES, read_regular
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.toml_file import parse_toml, read_toml
@@ -76,7 +76,7 @@ def _explained(name: str) -> Iterator[None]:
         yield
     except ValidationError as error:
         raise DescriptionError(
-            "\n".join(f"{name}: {explain(item)}" for item in error.errors())
+            "\n".join(f"{name}: {each}" for each in explain_all(error.errors()))
         ) from error
 
 

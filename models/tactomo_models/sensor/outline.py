@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -159,6 +160,11 @@ def polygon_outline(
 
 def _simple(key: str, corners: tuple[tuple[float, float], ...]) -> shapely.Polygon:
     closed = corners[:-1] if len(corners) > 3 and corners[0] == corners[-1] else corners
+    for number, (before, corner) in enumerate(pairwise(closed), start=1):
+        if corner == before:
+            raise ValueError(
+                f"{key}[{number}] is the corner before it once more: give each corner once"
+            )
     ring = shapely.Polygon(closed)
     if not ring.is_valid:
         why = shapely.is_valid_reason(ring)

@@ -64,6 +64,7 @@ def list_of_one(corners: list[list[float]], x_m: float) -> list[list[list[float]
         ({"outline_m": SQUARE[:2]}, r"outline_m"),
         ({"outline_m": [[0, 0], [0.01, 0], [0.02, 0]]}, r"outline_m.*(encloses no area|crosses)"),
         ({"outline_m": CIRCLE}, r"1499 points, more than 1000.*leave out"),
+        ({"outline_m": [SQUARE[0], *SQUARE]}, r"outline_m\[1\] is the corner before it once more"),
         ({"outline_m": SPIKE}, r"outline_m\[3\] is a corner of .* degrees.*cut its tip off"),
         ({"outline_m": [[x + 0.05, y] for x, y in SQUARE]}, r"middle.*0.05, 0.*subtract"),
         ({"outline_m": [[50 * x * 100, y] for x, y in SQUARE]}, r"outline_m"),
@@ -118,6 +119,18 @@ def test_a_file_that_is_refused_names_itself(tmp_path: Path) -> None:
     file.write_text(text.replace("[0, 0.06],\n    [-0.06, 0.06]", "[-0.06, 0.06], [0, 0.06]"))
     with pytest.raises(DescriptionError, match=r"bow.toml: sheet.*outline_m crosses"):
         load_description(file)
+
+
+def test_a_list_in_millimetres_is_one_complaint_that_says_so(tmp_path: Path) -> None:
+    file = tmp_path / "mm.toml"
+    text = (
+        Path(__file__).parents[3] / "models/tactomo_models/sensor/shipped/palm_l.toml"
+    ).read_text("utf-8")
+    file.write_text(text.replace("-0.06, -0.06", "-60, -60").replace("-0.06, 0.06", "-60, 60"))
+    said = r"outline_m\.0\.0 = -60.*in millimetres\? -60 mm are -0.06 m \(and 3 more of this list\)"
+    with pytest.raises(DescriptionError, match=said) as refused:
+        load_description(file)
+    assert str(refused.value).count("outline_m") == 1
 
 
 def test_an_outline_counts_either_way_round() -> None:
