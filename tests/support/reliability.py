@@ -39,7 +39,7 @@ These limits remain:
   ([what to do](your_own_sensor.md)).
 - A wide press that begins lightly may be missing in its first frames.
 - Scans that one board delays by half a second behind an honest counter can make a sliding press
-  look like drift: its pressure is then told too low, without a flag.
+  look like drift, or like two contacts: pressures and places are then wrong, without a flag.
 
 Machine: {machine}.
 
