@@ -57,9 +57,10 @@ FEW_STEPS = 4  # of starts that are compared: a start's cost says little before
 STEPS, FAR_STEPS = 4, 20
 HOPELESS = -6.0  # logarithm of odds: what is foreseen below is asked no more
 # Logarithm of odds: what is foreseen above is solved for, since the place of a contact turns on it.
-# Of 150 rivals of mixed presses, what was foreseen was right to 0.3 (median; 1.3 for 95 %). With -6
-# a cold frame has a fifth more solves and the same maps; with -1, maps at 20 dB lose 0.002.
-DOUBTFUL = -2.0
+# Of 150 rivals of mixed presses, what was foreseen was right to 0.3 (median; 1.3 for 95 %). With -2
+# one scene of a ring and a disc loses 0.004 of its correlation, with -1 maps at 20 dB 0.002; with
+# -6, a cold frame has more solves and the same maps.
+DOUBTFUL = -4.0
 SURE_STEPS = 6  # of a fit of two contacts from afar, before what it foresees is believed
 # Of chi-squared: what the Jacobian foresees of a last step is taken for true, without a solve.
 FORESEEN = 0.5
