@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
+from noisy_skin import rms
+from tactomo_lab.scenes.faults import with_lead
 from tactomo_models import SensorDescription, SkinSimulator
-from tactomo_models.arrays import BoolArray
+from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.physics.bare_sheet import exchanged
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.greens import PackedGreensFunction
@@ -17,6 +21,17 @@ def touches(description: SensorDescription, electrode: int) -> BoolArray:
     """Voltages (M,) that are driven or read by an electrode."""
     pairs = description.pairs
     return np.asarray((np.hstack([pairs.drive, pairs.measure]) == electrode).any(axis=1))
+
+
+BadLead = Callable[[SensorDescription, FloatArray, int], FloatArray]
+BAD_LEADS: Final[dict[str, BadLead]] = {
+    "open, reads 0 V": lambda d, v, e: with_lead(d, v, e, 1e-3, lambda *_: 0.0),
+    "open, floats": lambda d, v, e: with_lead(d, v, e, 1e-3, lambda *_: 3 * rms(v)),
+    "poor, half the signal": lambda d, v, e: with_lead(d, v, e, 0.5, lambda _, true: true / 2),
+    "silent": lambda d, v, e: np.where(touches(d, e), 1e-6 * v, v),
+    "gain halved": lambda d, v, e: np.where(d.pairs.measure[:, 0] == e, v / 2, v),
+}
+"""What becomes of a scan's voltages where the lead of an electrode is bad."""
 
 
 def shorted(simulator: SkinSimulator, first: int, second: int) -> SkinSimulator:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from faulty_skin import rewired, shorted, touches
+from faulty_skin import BAD_LEADS, BadLead, rewired, shorted, touches
 from noisy_skin import rms
 from tactomo_lab.scenes.faults import with_lead
 from tactomo_models import Artifact, Press, SensorDescription, SkinSimulator
@@ -92,23 +92,12 @@ def test_rates(paper: SensorDescription, artifact: Artifact) -> None:
     well = rates.count("healthy", noisy(lambda skin, _: rest(skin)))
     assert well["healthy"] == well["exact"] == well["n"]
 
-    leads: dict[str, Callable[[FloatArray, int], FloatArray]] = {
-        "lead open, reads 0 V": lambda v, e: with_lead(paper, v, e, 1e-3, lambda *_: 0.0),
-        "lead open, floats": lambda v, e: with_lead(paper, v, e, 1e-3, lambda *_: 3 * rms(v)),
-        "lead poor, half the signal": lambda v, e: with_lead(paper, v, e, 0.5, lambda _, p: p / 2),
-        "lead silent": lambda v, e: np.where(touches(paper, e), 1e-6 * v, v),
-        "gain of one input halved": lambda v, e: np.where(paper.pairs.measure[:, 0] == e, v / 2, v),
-    }
-    for name, broken in leads.items():
+    for name, broken in BAD_LEADS.items():
 
-        def change(
-            skin: SkinSimulator,
-            electrode: int,
-            broken: Callable[[FloatArray, int], FloatArray] = broken,
-        ) -> FloatArray:
-            return broken(rest(skin), electrode)
+        def change(skin: SkinSimulator, electrode: int, broken: BadLead = broken) -> FloatArray:
+            return broken(paper, rest(skin), electrode)
 
-        seen = rates.count(name, noisy(change), lambda e: {e})
+        seen = rates.count(f"lead {name}", noisy(change), lambda e: {e})
         assert seen["healthy"] == seen["broken"] == 0
         assert seen["exact"] == seen["n"]
 
@@ -122,7 +111,7 @@ def test_rates(paper: SensorDescription, artifact: Artifact) -> None:
         skin: SkinSimulator, noise: float, rng: np.random.Generator, electrode: int
     ) -> FloatArray:
         made = scans(rest(skin), noise * rms(rest(skin)), rng)
-        opened = with_lead(paper, rest(skin), electrode, 1e-3, lambda *_: 0.0)
+        opened = BAD_LEADS["open, reads 0 V"](paper, rest(skin), electrode)
         made[rng.choice(SCANS, 4, replace=False)] += opened - rest(skin)
         return made
 

@@ -12,9 +12,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from faulty_skin import rewired, shorted, touches
+from faulty_skin import BAD_LEADS, BadLead, rewired, shorted
 from noisy_skin import Skin, rms
-from tactomo_lab.scenes.faults import with_lead
 from tactomo_models import (
     Artifact,
     Flag,
@@ -130,20 +129,17 @@ def test_rates(paper: SensorDescription, artifact: Artifact) -> None:
     print(f"\n{'':32s}    n  flagged any flag confidently wrong")
     clean = rates.count("nothing wrong (share unflagged)", simulators, Flag(0))
     found = {}
-    leads: dict[str, Callable[[FloatArray], FloatArray]] = {
-        "lead open, reads 0 V": lambda v: with_lead(paper, v, 6, 1e-3, lambda *_: 0.0),
-        "lead open, floats": lambda v: with_lead(paper, v, 6, 1e-3, lambda *_: 3 * rms(v)),
-        "lead poor, half the signal": lambda v: with_lead(paper, v, 6, 0.5, lambda _, p: p / 2),
-        "lead silent": lambda v: np.where(touches(paper, 6), 1e-6 * v, v),
-        "a pair of inputs dead": lambda v: np.where(
-            (paper.pairs.drive[:, 0] == 6) | (paper.pairs.measure[:, 0] == 6), 1e-6 * v, v
+    leads: dict[str, BadLead] = {
+        **BAD_LEADS,
+        "of a pair of inputs, both dead": lambda d, v, e: np.where(
+            (d.pairs.drive[:, 0] == e) | (d.pairs.measure[:, 0] == e), 1e-6 * v, v
         ),
-        "gain of one input halved": lambda v: np.where(paper.pairs.measure[:, 0] == 6, v / 2, v),
     }
-    for name, broken in leads.items():
+    for kind, broken in leads.items():
+        name = f"lead {kind}"
 
-        def change(scans: Scans, broken: Callable[[FloatArray], FloatArray] = broken) -> Scans:
-            return {**scans, "structure": broken(scans["structure"])}
+        def change(scans: Scans, broken: BadLead = broken) -> Scans:
+            return {**scans, "structure": broken(paper, scans["structure"], 6)}
 
         found[name] = rates.count(name, simulators, Flag.ELECTRODE_FAULT, later=change)
         both = f"{name}, at tare"
