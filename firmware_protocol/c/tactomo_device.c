@@ -281,3 +281,18 @@ bool tactomo_device_send_scan(tactomo_device *device, uint32_t counter, uint8_t 
     device->dropped++;
     return false;
 }
+
+bool tactomo_device_send_companion(tactomo_device *device, uint8_t index, uint32_t taken_us,
+                                   uint8_t flags, float value)
+{
+    const tactomo_settings *settings = &device->settings;
+    tactomo_companion reading;
+    if (!device->scanning)
+        return false;
+    reading.index = index;
+    reading.flags = flags;
+    reading.device_us = clock_at(device, taken_us);
+    reading.value = value;
+    return speak(device) && send_frame(device, tactomo_encode_companion(&reading, settings->frame,
+                                                                        settings->frame_room));
+}

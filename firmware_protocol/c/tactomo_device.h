@@ -87,6 +87,12 @@ uint32_t tactomo_device_zero_counter(tactomo_device *device);
 bool tactomo_device_send_scan(tactomo_device *device, uint32_t counter, uint8_t channel,
                               uint32_t started_us, uint8_t flags, const void *samples);
 
+/* Sends one reading of a companion, such as a load cell; call it before the scan that begins after
+ * the reading was taken. `taken_us` is the timer then. Returns false where it was dropped: stopped,
+ * no room, or a value that is not finite. */
+bool tactomo_device_send_companion(tactomo_device *device, uint8_t index, uint32_t taken_us,
+                                   uint8_t flags, float value);
+
 /* Says hello at once: one of its fields has changed. Returns false where it breaks a rule of the
  * specification; no scan is sent until it keeps them again. */
 bool tactomo_device_announce(tactomo_device *device);

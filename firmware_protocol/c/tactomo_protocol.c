@@ -263,6 +263,21 @@ size_t tactomo_encode_acknowledge(uint8_t request, uint8_t command, uint8_t stat
     return tactomo_frame_end(&frame);
 }
 
+size_t tactomo_encode_companion(const tactomo_companion *reading, uint8_t *out, size_t room)
+{
+    tactomo_frame frame;
+    uint32_t bits;
+    if (!is_finite((double)reading->value) || reading->device_us >> TACTOMO_CLOCK_BITS != 0)
+        return 0;
+    memcpy(&bits, &reading->value, sizeof bits);
+    tactomo_frame_begin(&frame, out, room, TACTOMO_COMPANION);
+    tactomo_frame_u8(&frame, reading->index);
+    tactomo_frame_u8(&frame, reading->flags);
+    tactomo_frame_u64(&frame, reading->device_us);
+    tactomo_frame_u32(&frame, bits);
+    return tactomo_frame_end(&frame);
+}
+
 /* --- Reading commands ------------------------------------------------------------------------- */
 
 static void start_frame(tactomo_parser *parser)

@@ -18,6 +18,7 @@ enum {
     TACTOMO_SCAN = 0x01,
     TACTOMO_HELLO = 0x02,
     TACTOMO_ACKNOWLEDGE = 0x03,
+    TACTOMO_COMPANION = 0x04,
     TACTOMO_COMMAND = 0x81
 };
 
@@ -26,7 +27,7 @@ enum { TACTOMO_MAGNITUDE = 0, TACTOMO_STRUCTURE = 1 }; /* channels */
 /* Sample formats: int16_t, int32_t, float. */
 enum { TACTOMO_INT16 = 1, TACTOMO_INT32 = 2, TACTOMO_FLOAT32 = 3 };
 
-/* Flags of a scan. */
+/* Flags of a scan, and but for LATE of a companion's reading. */
 enum { TACTOMO_SATURATED = 0x01, TACTOMO_LATE = 0x02, TACTOMO_SIMULATED = 0x04 };
 
 /* Codes of commands. */
@@ -63,6 +64,7 @@ enum {
 #define TACTOMO_SCAN_BOUND(count, sample_bytes) TACTOMO_FRAME_BOUND(24 + (count) * (sample_bytes))
 #define TACTOMO_HELLO_BOUND TACTOMO_FRAME_BOUND(31 + 2 * TACTOMO_LONGEST_TEXT)
 #define TACTOMO_ACKNOWLEDGE_BOUND TACTOMO_FRAME_BOUND(9)
+#define TACTOMO_COMPANION_BOUND TACTOMO_FRAME_BOUND(20)
 #define TACTOMO_COMMAND_BOUND TACTOMO_FRAME_BOUND(TACTOMO_COMMAND_PAYLOAD)
 
 /* --- Writing ---------------------------------------------------------------------------------- */
@@ -92,6 +94,14 @@ typedef struct {
     const char *firmware;   /* likewise: its version, for people */
 } tactomo_hello;
 
+/* One reading of a companion, such as a load cell beneath the sheets. */
+typedef struct {
+    uint8_t index; /* which companion */
+    uint8_t flags;
+    uint64_t device_us; /* when it was taken, by the clock of the scans; below 2^53 */
+    float value;        /* finite, in the companion's own unit */
+} tactomo_companion;
+
 /* Each writes one frame with both delimiters and returns its size in bytes; 0 where the packet
  * breaks a rule of the specification, or `room` is too small for it. The samples are read once and
  * go straight to `out`. */
@@ -99,6 +109,7 @@ size_t tactomo_encode_scan(const tactomo_scan *scan, uint8_t *out, size_t room);
 size_t tactomo_encode_hello(const tactomo_hello *hello, uint8_t *out, size_t room);
 size_t tactomo_encode_acknowledge(uint8_t request, uint8_t command, uint8_t status, uint8_t *out,
                                   size_t room);
+size_t tactomo_encode_companion(const tactomo_companion *reading, uint8_t *out, size_t room);
 
 /* The same piece by piece, for packet types of your own (0x70 to 0x7F): begin, append, end. */
 typedef struct {

@@ -167,6 +167,12 @@ def test_a_scan_against_the_rules_is_not_encoded(sanitized: Speaker, scan: str) 
     assert not answered(sanitized.ask("scan", scan, "00" * 2050))
 
 
+@pytest.mark.parametrize("reading", [f"0 0 {2**53} 0", "0 0 0 2143289344", "0 0 0 4286578688"])
+def test_a_companion_against_the_rules_is_not_encoded(sanitized: Speaker, reading: str) -> None:
+    assert answered(sanitized.ask("companion 0 0 0 1065353216"))
+    assert not answered(sanitized.ask("companion", reading))  # a clock too far, NaN, -infinity
+
+
 def test_there_is_no_status_4(sanitized: Speaker) -> None:
     assert not answered(sanitized.ask("acknowledge 0 0 4"))
 

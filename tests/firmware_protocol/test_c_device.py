@@ -24,6 +24,7 @@ from tactomo_protocol import (
     Channel,
     Command,
     CommandCode,
+    CompanionReading,
     Decoder,
     Hello,
     Packet,
@@ -125,6 +126,15 @@ def test_the_nearest_rate_is_kept_and_stated(
     assert acknowledge == Acknowledge(5, SET_RATE, OK)
     assert isinstance(hello, Hello)
     assert hello.scan_rate_hz == pytest.approx(kept_hz, rel=1e-12)
+
+
+def test_a_companions_reading_leaves_with_the_scans_clock(device: SimulatedDevice) -> None:
+    device.pass_time(PERIOD_US)
+    words = ("send_companion", 2, PERIOD_US - 10, 0, 0x42280000)  # 42.0
+    assert device.speaker.ask(*words) == "0", "it is stopped"
+    device.tell(Command(START, 1))
+    assert device.speaker.ask(*words) == "1"
+    assert device.said() == [CompanionReading(2, ScanFlag(0), PERIOD_US - 10, 42.0)]
 
 
 def test_a_busy_device_says_so_and_still_stops(scanning: SimulatedDevice) -> None:

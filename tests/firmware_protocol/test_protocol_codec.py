@@ -15,6 +15,7 @@ from tactomo_protocol import (
     Channel,
     Command,
     CommandCode,
+    CompanionReading,
     Decoder,
     FieldError,
     Hello,
@@ -150,10 +151,12 @@ BAD_FIELDS = [
     (Acknowledge(256, 1, AckStatus.OK), "Acknowledge.request", "from 0 to 255"),
     (Acknowledge(0, 256, AckStatus.OK), "Acknowledge.command", "from 0 to 255"),
     (Acknowledge(0, 1, 4), "Acknowledge.status", "3 (BUSY)"),  # type: ignore[arg-type]
+    (CompanionReading(0, ScanFlag(0), 0, math.inf), "CompanionReading.value", "finite"),
+    (CompanionReading(0, ScanFlag(0), 0, 1e39), "CompanionReading.value", "float32"),
     (UnknownPacket(1, b""), "UnknownPacket.type", "does not define"),
     (UnknownPacket(300, b""), "UnknownPacket.type", "from 0 to 255"),
     (UnknownPacket(9, bytes(4115)), "UnknownPacket.body", "at most 4114 bytes"),
-    ("scan", "packet", "a Scan, Hello, Acknowledge, Command or UnknownPacket"),
+    ("scan", "packet", "a Scan, Hello, Acknowledge, CompanionReading, Command or"),
 ]
 
 

@@ -17,6 +17,7 @@ from tactomo_protocol import (
     Channel,
     Command,
     CommandCode,
+    CompanionReading,
     Hello,
     Packet,
     SampleFormat,
@@ -26,7 +27,7 @@ from tactomo_protocol import (
 )
 
 PAGE = "firmware_protocol/PROTOCOL.md"
-CODES = {"u8": "<B", "u16": "<H", "u32": "<I", "u64": "<Q", "f64": "<d"}
+CODES = {"u8": "<B", "u16": "<H", "u32": "<I", "u64": "<Q", "f32": "<f", "f64": "<d"}
 LAYOUT = {"checksum", "reserved", "count", "sample_format", ""}
 """Names of what is in a frame and no field of the packet, or not of every one."""
 BOTH = (Channel.MAGNITUDE, Channel.STRUCTURE)
@@ -40,6 +41,10 @@ PACKETS: list[tuple[str, Packet]] = [
         Hello("left", "1.2", BOTH, 16, 3, 5, 208, SampleFormat.INT32, 2.5e-9, 19.5),
     ),
     ("### Acknowledge (0x03, device to host)", Acknowledge(9, CommandCode.STOP, AckStatus.BUSY)),
+    (
+        "### Companion (0x04, device to host)",
+        CompanionReading(3, ScanFlag.SATURATED, 2**41 + 5, 123.5),
+    ),
     ("### Command (0x81, host to device)", Command(CommandCode.SET_RATE, 77, 12.5)),
 ]
 

@@ -67,7 +67,7 @@ def test_stream_vectors() -> None:
 
 def test_every_kind_of_packet_and_of_error_has_a_vector() -> None:
     kinds = {vector["fields"]["packet"] for vector in load("packets.json")}
-    assert kinds == {"scan", "hello", "acknowledge", "command", "unknown"}
+    assert kinds == {"scan", "hello", "acknowledge", "companion", "command", "unknown"}
     counted = {name for vector in load("streams.json") for name, n in vector["counts"].items() if n}
     assert counted == set(asdict(Decoder().counts))
 

@@ -14,6 +14,7 @@ from tactomo_protocol import (
     Channel,
     Command,
     CommandCode,
+    CompanionReading,
     Hello,
     Packet,
     SampleFormat,
@@ -75,10 +76,21 @@ COMMANDS = st.builds(
     U8,
 ) | st.builds(Command, st.just(CommandCode.SET_RATE), U8, POSITIVE)
 ACKNOWLEDGES = st.builds(Acknowledge, U8, U8, st.sampled_from(AckStatus))
-UNKNOWNS = st.builds(
-    UnknownPacket, U8.filter(lambda kind: kind not in (1, 2, 3, 0x81)), st.binary(max_size=300)
+COMPANIONS = st.builds(
+    CompanionReading,
+    U8,
+    U8.map(ScanFlag),
+    st.integers(0, MAX_DEVICE_US),
+    st.floats(width=32, allow_nan=False, allow_infinity=False),
 )
-PACKETS: st.SearchStrategy[Packet] = st.one_of(scans(), hellos(), COMMANDS, ACKNOWLEDGES, UNKNOWNS)
+UNKNOWNS = st.builds(
+    UnknownPacket,
+    U8.filter(lambda kind: kind not in (1, 2, 3, 4, 0x81)),
+    st.binary(max_size=300),
+)
+PACKETS: st.SearchStrategy[Packet] = st.one_of(
+    scans(), hellos(), COMMANDS, ACKNOWLEDGES, COMPANIONS, UNKNOWNS
+)
 SMALL_PACKETS: st.SearchStrategy[Packet] = st.one_of(
-    scans(max_samples=4), hellos(), COMMANDS, ACKNOWLEDGES
+    scans(max_samples=4), hellos(), COMMANDS, ACKNOWLEDGES, COMPANIONS
 )

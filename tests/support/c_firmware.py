@@ -14,6 +14,7 @@ from tactomo_protocol import (
     Acknowledge,
     Channel,
     Command,
+    CompanionReading,
     Decoder,
     DecoderCounts,
     Hello,
@@ -122,6 +123,9 @@ def request_for(packet: Packet) -> tuple[object, ...]:
             )
         case Acknowledge():
             return "acknowledge", packet.request, packet.command, int(packet.status)
+        case CompanionReading():
+            [bits] = struct.unpack("<I", struct.pack("<f", packet.value))
+            return "companion", packet.index, int(packet.flags), packet.device_us, bits
         case Command():
             body = struct.pack("<BBd", packet.code, packet.request, packet.rate_hz)
             return "packet", 0x81, body.hex()

@@ -32,6 +32,7 @@ from tactomo_protocol import (
     Channel,
     Command,
     CommandCode,
+    CompanionReading,
     DecoderCounts,
     Hello,
     Packet,
@@ -65,6 +66,14 @@ def fields(packet: Packet) -> JsonMap:
         case Hello():
             channels = [channel.number for channel in packet.channels]
             return {"packet": "hello", **asdict(packet), "channels": channels}
+        case CompanionReading():
+            return {
+                "packet": "companion",
+                "index": packet.index,
+                "flags": int(packet.flags),
+                "device_us": str(packet.device_us),
+                "value": f"0x{np.float32(packet.value).view(np.uint32):08x}",
+            }
         case UnknownPacket():
             return {"packet": "unknown", "type": packet.type, "body": packet.body.hex()}
         case Command(rate_hz=rate_hz) if math.isnan(rate_hz):
@@ -186,6 +195,11 @@ def _packets() -> Iterator[tuple[str, str, Packet]]:
         "the most samples of the widest format and hardly a zero: the largest frame",
         _scan(Channel.STRUCTURE, 5, np.full(MAX_SAMPLES, -2, dtype=np.int32)),
     )
+    load_cell = CompanionReading(0, ScanFlag.SIMULATED, 1_000_000, -8_388_607.0)
+    yield "companion", "24 bits of a load cell's converter are exact in a float32", load_cell
+    largest = CompanionReading(255, ScanFlag(255), MAX_DEVICE_US, float(np.finfo(np.float32).max))
+    yield "companion_largest", "every field at its end", largest
+    yield "companion_zero", "every field zero", CompanionReading(0, ScanFlag(0), 0, 0.0)
     for size in (253, 254, 255):
         name = f"cobs_run_of_{size}"
         yield name, f"a payload of {size} bytes without a zero", _without_zeros(size)
@@ -378,6 +392,10 @@ def _refused_frames(first: Scan, second: Scan, a: bytes, b: bytes) -> Iterator[_
     yield between("hello_firmware_beyond", "as above, in the last string", _changed(hello, 35, 6))
     yield between("hello_firmware_empty", "a string of no bytes", _changed(hello, 35, 0)[:36])
     yield between("hello_trailing_byte", "longer than its strings", hello + b"\x01")
+    reading = _content(CompanionReading(1, ScanFlag(0), 5, 2.5))
+    yield between("companion_nan", "a value that is no number", reading[:12] + b"\0\0\xc0\x7f")
+    yield between("companion_short", "its last byte is missing", reading[:-1])
+    yield between("companion_clock_beyond", "2^53 µs", reading[:10] + b"\x20\0" + reading[12:])
     yield between("command_short", "its last byte is missing", start[:-1])
     yield between("acknowledge_status_4", "no such status", b"\x01\x03\x07\x02\x04")
     yield _Stream(

@@ -75,6 +75,14 @@ static void acknowledge(const uint8_t *data, size_t n, uint8_t *out, size_t room
           TACTOMO_ACKNOWLEDGE_BOUND, TACTOMO_ACKNOWLEDGE);
 }
 
+static void companion(const uint8_t *data, size_t n, uint8_t *out, size_t room)
+{
+    tactomo_companion reading;
+    draw(&data, &n, &reading, sizeof reading);
+    check(out, tactomo_encode_companion(&reading, out, room), TACTOMO_COMPANION_BOUND,
+          TACTOMO_COMPANION);
+}
+
 static void command(const uint8_t *data, size_t n, uint8_t *out, size_t room)
 {
     uint8_t body[10];
@@ -87,8 +95,8 @@ static void command(const uint8_t *data, size_t n, uint8_t *out, size_t room)
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t n)
 {
-    static void (*const each[])(const uint8_t *, size_t, uint8_t *, size_t) = {scan, hello,
-                                                                             acknowledge, command};
+    static void (*const each[])(const uint8_t *, size_t, uint8_t *, size_t) = {
+        scan, hello, acknowledge, command, companion};
     uint8_t which = 0;
     uint16_t room = 0;
     uint8_t *out;
@@ -97,7 +105,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t n)
     if (which & 128)
         room = LONGEST_FRAME;
     out = malloc(room > 0 ? room : 1u); /* so that a byte too many is seen */
-    each[which & 3](data, n, out, room);
+    each[(which & 127) % 5](data, n, out, room);
     free(out);
     return 0;
 }

@@ -3,6 +3,7 @@
  * Frames:  scan CHANNEL FLAGS COUNTER DEVICE_US FORMAT COUNT SAMPLES     -> frame
  *          hello CHANNELS FORMAT SAMPLES ELECTRODES DRIVE MEASURE VOLTS RATE ID FIRMWARE
  *          acknowledge REQUEST COMMAND STATUS
+ *          companion INDEX FLAGS DEVICE_US VALUE (bits of a float, decimal)
  *          packet TYPE BODY
  *          parse RUN BYTES                       -> counts | commands (code, request, rate)
  * A device on a board without hardware:
@@ -10,6 +11,7 @@
  *          at TIMER; room BYTES; receive BYTES; busy 0|1; poll; announce
  *          sent                                  -> what was sent since the last time
  *          due; begin_scan; zero_counter; send COUNTER CHANNEL STARTED FLAGS; state
+ *          send_companion INDEX TAKEN FLAGS VALUE
  *
  * Bytes are hex, "-" for none; samples are hex of little-endian values; doubles are hex of their 64
  * bits; other numbers are decimal.
@@ -133,6 +135,24 @@ static void acknowledge(void)
     print_hex(out, tactomo_encode_acknowledge(request, command, status, out, sizeof out));
 }
 
+static float single(void)
+{
+    uint32_t bits = (uint32_t)whole();
+    float value;
+    memcpy(&value, &bits, sizeof value);
+    return value;
+}
+
+static void companion(void)
+{
+    tactomo_companion fields;
+    fields.index = byte();
+    fields.flags = byte();
+    fields.device_us = whole();
+    fields.value = single();
+    print_hex(out, tactomo_encode_companion(&fields, out, sizeof out));
+}
+
 static void packet(void)
 {
     tactomo_frame frame;
@@ -243,6 +263,14 @@ static void send_scan(void)
                                             samples));
 }
 
+static void send_companion(void)
+{
+    uint8_t index = byte();
+    uint32_t taken_us = (uint32_t)whole();
+    uint8_t flags = byte();
+    printf("%d\n", tactomo_device_send_companion(&device, index, taken_us, flags, single()));
+}
+
 static void take_sent(void)
 {
     print_hex(sent, sent_bytes);
@@ -286,6 +314,7 @@ int main(void)
         void (*answer)(void);
     } known[] = {{"scan", scan},   {"hello", hello}, {"acknowledge", acknowledge},
                  {"packet", packet}, {"parse", parse}, {"begin", begin},
+                 {"companion", companion}, {"send_companion", send_companion},
                  {"send", send_scan}, {"sent", take_sent}, {"state", print_state}};
     static char line[2 * MAX_BYTES];
     while (fgets(line, sizeof line, stdin) != NULL) {

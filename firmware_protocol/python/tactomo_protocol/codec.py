@@ -7,6 +7,7 @@ which means nothing. PROTOCOL.md is the specification; this module follows it fi
 
 from __future__ import annotations
 
+import contextlib
 import math
 import operator
 import re
@@ -23,6 +24,7 @@ from .packets import (
     Channel,
     Command,
     CommandCode,
+    CompanionReading,
     Hello,
     Packet,
     SampleFormat,
@@ -40,14 +42,21 @@ MAX_DEVICE_US = 2**53 - 1
 MIN_RATE_HZ, MAX_RATE_HZ = 1e-3, 1e6
 """A scan in 1000 s, which C's 32-bit timer still spans; one a microsecond, the clock's unit."""
 
-_SCAN, _HELLO, _ACKNOWLEDGE, _COMMAND = 0x01, 0x02, 0x03, 0x81
-_KNOWN_TYPES = {_SCAN: "scan", _HELLO: "hello", _ACKNOWLEDGE: "acknowledge", _COMMAND: "command"}
+_SCAN, _HELLO, _ACKNOWLEDGE, _COMPANION, _COMMAND = 0x01, 0x02, 0x03, 0x04, 0x81
+_KNOWN_TYPES = {
+    _SCAN: "scan",
+    _HELLO: "hello",
+    _ACKNOWLEDGE: "acknowledge",
+    _COMPANION: "companion",
+    _COMMAND: "command",
+}
 
 # Each layout starts with the version and the type, as the payload does.
 _PREFIX = struct.Struct("<BB")
 _SCAN_HEAD = struct.Struct("<BBBBIQBBH")
 _HELLO_HEAD = struct.Struct("<BBBBHBBddB")
 _ACKNOWLEDGE_BODY = struct.Struct("<BBBBB")
+_COMPANION_BODY = struct.Struct("<BBBBQf")
 _COMMAND_BODY = struct.Struct("<BBBBd")
 _CRC_BYTES = 4
 
@@ -193,11 +202,14 @@ def _pack(packet: Packet) -> bytes:
             return _pack_hello(packet)
         case Acknowledge():
             return _pack_acknowledge(packet)
+        case CompanionReading():
+            return _pack_companion(packet)
         case Command():
             return _pack_command(packet)
         case UnknownPacket():
             return _pack_unknown(packet)
-    raise FieldError("packet", packet, "a Scan, Hello, Acknowledge, Command or UnknownPacket")
+    allowed = "a Scan, Hello, Acknowledge, CompanionReading, Command or UnknownPacket"
+    raise FieldError("packet", packet, allowed)
 
 
 def _unpack(kind: int, content: bytes) -> Packet:
@@ -208,6 +220,8 @@ def _unpack(kind: int, content: bytes) -> Packet:
         return _unpack_hello(content)
     if kind == _ACKNOWLEDGE:
         return _unpack_acknowledge(content)
+    if kind == _COMPANION:
+        return _unpack_companion(content)
     if kind == _COMMAND:
         return _unpack_command(content)
     return UnknownPacket(kind, content[_PREFIX.size :])
@@ -322,6 +336,27 @@ def _unpack_acknowledge(content: bytes) -> Acknowledge:
     _check_size(len(content) == _ACKNOWLEDGE_BODY.size)
     _, _, request, command, status = _ACKNOWLEDGE_BODY.unpack(content)
     return Acknowledge(request, _command_code(command), AckStatus(status))
+
+
+def _pack_companion(reading: CompanionReading) -> bytes:
+    head = (
+        _integer("CompanionReading.index", reading.index, 0, _U8),
+        _integer("CompanionReading.flags", reading.flags, 0, _U8),
+        _integer("CompanionReading.device_us", reading.device_us, 0, MAX_DEVICE_US),
+    )
+    if _is_finite(reading.value):
+        with contextlib.suppress(OverflowError):  # beyond every float32
+            return _COMPANION_BODY.pack(PROTOCOL_VERSION, _COMPANION, *head, reading.value)
+    raise FieldError("CompanionReading.value", reading.value, "a finite float32")
+
+
+def _unpack_companion(content: bytes) -> CompanionReading:
+    _check_size(len(content) == _COMPANION_BODY.size)
+    _, _, index, flags, device_us, value = _COMPANION_BODY.unpack(content)
+    _integer("CompanionReading.device_us", device_us, 0, MAX_DEVICE_US)
+    if not math.isfinite(value):
+        raise FieldError("CompanionReading.value", value, "finite")
+    return CompanionReading(index, ScanFlag(flags), device_us, value)
 
 
 def _pack_command(command: Command) -> bytes:

@@ -176,6 +176,21 @@ class Acknowledge:
 
 
 @dataclass(frozen=True, slots=True)
+class CompanionReading:
+    """A reading of a companion: a scalar beside the sheets, such as a load cell.
+
+    `index` (u8) tells companions apart. `device_us` is the device's clock, that of the scans, in
+    µs, when the reading was taken. `value` is finite, travels as a float32 and has the companion's
+    own unit. Of `ScanFlag`, LATE means nothing here.
+    """
+
+    index: int
+    flags: ScanFlag
+    device_us: int
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
 class UnknownPacket:
     """An intact packet of this protocol version whose type is not known here; ignore it."""
 
@@ -183,4 +198,4 @@ class UnknownPacket:
     body: bytes
 
 
-Packet: TypeAlias = Scan | Hello | Acknowledge | Command | UnknownPacket
+Packet: TypeAlias = Scan | Hello | Acknowledge | CompanionReading | Command | UnknownPacket
