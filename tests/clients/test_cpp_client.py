@@ -145,11 +145,8 @@ def python_view(frame: Frame) -> dict[str, Any]:
 def cpp_view(said: dict[str, Any]) -> dict[str, Any]:
     """The frame that the probe printed, in the words of `python_view`."""
     view = {**said, "flags": sorted(set(said["flags"]))}
-    del (
-        view["age_now_ns"],
-        view["exceeds_150"],
-        view["is_known"],
-    )  # they go by the time at which they are asked for
+    for name in ("age_now_ns", "exceeds_150", "is_known"):  # they go by the time of asking
+        del view[name]
     for name in ("tier", "tier_reason", "dated_by"):
         view[name] = said[name] or None
     view["contacts"] = [{**each, "frame": each["frame"] or None} for each in said["contacts"]]
@@ -525,18 +522,8 @@ def any_value(dice: random.Random) -> Any:
             *(None, True, 0, 1, -1, 255, 2**32, -(2**31), 2**62, 1.5, -0.0, "", "within", "ä€😀"),
             *(math.nan, -math.inf, 2**63, 2**64 - 1, -(2**63)),
             *(b"", b"\0" * 48, [], {}, [1, 2], [3.5, -4], [[]], {"a": 1}, ["misfit_high"]),
-            *(
-                "left",
-                "map",
-                "contacts",
-                "<f4",
-                "<f8",
-                [3, 4],
-                [4, 3],
-                [0, 0],
-                [12],
-                [2**20, 2**20],
-            ),
+            *("left", "map", "contacts", "<f4", "<f8"),
+            *([3, 4], [4, 3], [0, 0], [12], [2**20, 2**20]),
         ]
     )
 
@@ -613,29 +600,17 @@ def test_both_clients_agree_on_what_is_a_frame(checked: Path, kind: str) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [CONTACTS, MAP])
-def test_no_bytes_crash_it(checked: Path, kind: str) -> None:
-    dice = random.Random(f"crash {kind}")
-    whole = encode_message("left", kind, examples()[kind])
-    messages = [corrupted(whole, dice) for _ in range(4000)] + [whole]
-    deep = b"left/%b\0" % kind.encode() + b"\x81\xa1a" + b"\x91" * 100_000
-    wide = b"left/%b\0" % kind.encode() + b"\xdf\xff\xff\xff\xff"
-    outcomes = decode(checked, "left", kind, [b"", deep, wide, *messages])
-    assert len(outcomes) == len(messages) + 3
-    assert "problem" not in outcomes[-1]
-
-
-@pytest.mark.slow
 def test_garbage_over_a_socket_is_skipped(sensor: FakeSensor, checked: Path) -> None:
     dice = random.Random(5)
     whole = encode_message("left", MAP, examples()[MAP])
+    deep, wide = b"\x81\xa1a" + b"\x91" * 100_000, b"\xdf\xff\xff\xff\xff"
     with Watch(checked, "left", sensor.address, "map") as skin:
         assert sensor.wait_for_subscriber(PATIENCE_S) == b"left/map\0"
-        for _ in range(500):
-            sensor.send(b"left/map\0" + corrupted(whole[9:], dice))
+        for garbage in (b"", deep, wide, *(corrupted(whole[9:], dice) for _ in range(1000))):
+            sensor.send(b"left/map\0" + garbage)
         sensor.publish(sequence=9_999)
         seen = skin.wait(lambda s: s["frame"] and s["frame"]["sequence"] == 9_999, "the whole one")
-    assert seen["malformed"] > 100
+    assert seen["malformed"] > 200
 
 
 @pytest.mark.slow

@@ -9,8 +9,6 @@ import shutil
 import socket
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -28,11 +26,12 @@ from tactomo.stream import keys as key_files
 from tactomo.stream.access_control import AccessControl, ServerKeys
 from tactomo_client import (
     ClientError,
+    Frame,
     Keys,
     KeysError,
     NoAnswer,
     Status,
-    StreamTimeout,
+    Subscription,
     aio,
     request,
     subscribe,
@@ -114,18 +113,16 @@ def guarded(bench: Start, robot: Robot) -> Any:
 def test_an_allowed_client_commands_and_reads_frames(guarded: Any, robot: Robot) -> None:
     guarded.tare()
     folder = robot.allow(robot.client("ros"))
-    address = guarded.daemon.stream_address
     assert guarded.ask("status")["state"] in ("running", "stale")
-    with subscribe(SERVER, address=address, timeout_s=0.2, keys=folder) as skin:
-        deadline = time.monotonic() + PATIENCE_S
-        while time.monotonic() < deadline:
-            guarded.step(0.1)
-            try:
-                assert next(skin).sensor == SERVER
-                return
-            except StreamTimeout:
-                continue
-    pytest.fail("no frame came")
+    with subscribe(SERVER, address=guarded.daemon.stream_address, keys=folder) as skin:
+        assert first_frame(guarded, skin).sensor == SERVER
+
+
+def first_frame(guarded: Any, skin: Subscription[Frame]) -> Frame:
+    """Return the first frame that comes to a subscription, of a skin that goes on scanning."""
+    frame = wait_until(skin.latest, meanwhile=lambda: guarded.step(0.1))
+    assert frame is not None
+    return frame
 
 
 @pytest.mark.slow
@@ -227,10 +224,7 @@ def test_a_client_that_is_not_listed_is_refused_and_told_of(guarded: Any, robot:
         assert refused.value.name == "key_refused"
         robot.allow(stranger)  # and now it is let in, without a restart of either
         guarded.tare()
-        deadline = time.monotonic() + PATIENCE_S
-        while skin.latest() is None and time.monotonic() < deadline:
-            guarded.step(0.1)
-        assert skin.latest() is not None
+        assert first_frame(guarded, skin)
 
 
 def test_a_reader_may_not_command(guarded: Any, robot: Robot) -> None:
@@ -273,21 +267,14 @@ def test_who_is_revoked_is_cut_off_and_the_others_come_back(guarded: Any, robot:
     guarded.tare()
     ros = robot.allow(robot.client("ros"))
     with subscribe(SERVER, address=guarded.daemon.stream_address, keys=ros) as skin:
-        deadline = time.monotonic() + PATIENCE_S
-        while skin.latest() is None:
-            assert time.monotonic() < deadline
-            guarded.step(0.1)
+        last = first_frame(guarded, skin)
         robot.revoke("ros")
-        last = skin.latest()
-        assert last is not None
-        events: list[dict[str, Any]] = []
-        while not events:  # it tries to come in again and again
-            assert time.monotonic() < deadline + PATIENCE_S
+        refused: list[dict[str, Any]] = []
+        while not refused:  # it tries to come in again and again
             with contextlib.suppress(KeysError):
                 last = next(skin)
-            events = guarded.listener.of("event")
-            events = [event for event in events if event["name"] == "client_refused"]
-        assert Keys.load(ros).public.decode() in events[0]["detail"]
+            refused = [e for e in guarded.listener.of("event") if e["name"] == "client_refused"]
+        assert Keys.load(ros).public.decode() in refused[0]["detail"]
         for _ in range(5):
             assert guarded.step(0.2)["scan_counter"] > last.scan_counter
         assert skin.latest() is last
@@ -311,77 +298,6 @@ def test_a_command_of_one_who_was_revoked_ends(
         commander.timeout_s = 2.0
         with pytest.raises(ClientError):
             commander.status()
-
-
-def test_one_who_listens_in_sees_nothing(guarded: Any) -> None:
-    """Between client and server sits a relay that keeps every byte of the conversation."""
-    relay = Relay(guarded.daemon.stream_address)
-    with relay:
-        sub: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
-        with sub:
-            sub.setsockopt(zmq.LINGER, 0)
-            sub.subscribe(b"")
-            sub.curve_publickey, sub.curve_secretkey = guarded.keys.public, guarded.keys.secret
-            sub.curve_serverkey = guarded.keys.server
-            sub.connect(relay.address)
-            assert sub.poll(int(PATIENCE_S * 1000))
-            message = sub.recv()
-    assert message.startswith(b"left/")
-    assert len(relay.heard) > len(message)
-    assert b"CURVE" in relay.heard
-    for word in (b"left/", b"status", b"schema", b"session", guarded.daemon.session.encode()):
-        assert word in message or word == b"status"
-        assert word not in relay.heard
-
-
-class Relay:
-    """A TCP relay that remembers what both sides said."""
-
-    def __init__(self, target: str) -> None:
-        host, _, port = target.removeprefix("tcp://").rpartition(":")
-        self._pieces: list[bytes] = []  # of both directions, each by a thread of its own
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self.address = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
-        self._server = socket.create_connection((host, int(port)))
-        self._threads = [threading.Thread(target=self._accept)]
-
-    @property
-    def heard(self) -> bytes:
-        return b"".join(self._pieces)
-
-    def __enter__(self) -> Relay:
-        self._threads[0].start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._client.shutdown(socket.SHUT_RDWR)
-        self._server.shutdown(socket.SHUT_RDWR)
-        for thread in self._threads:
-            thread.join()
-        for sock in (self._client, self._server, self._listener):
-            sock.close()
-
-    def _accept(self) -> None:
-        self._client, _ = self._listener.accept()
-        back = threading.Thread(target=self._pass, args=(self._server, self._client))
-        self._threads.append(back)
-        back.start()
-        self._pass(self._client, self._server)
-
-    def _pass(self, source: socket.socket, sink: socket.socket) -> None:
-        while data := _received(source):
-            self._pieces.append(data)
-            try:
-                sink.sendall(data)
-            except OSError:
-                return
-
-
-def _received(source: socket.socket) -> bytes:
-    try:
-        return source.recv(65_536)
-    except OSError:
-        return b""
 
 
 def test_without_a_doorkeeper_the_door_stays_shut(robot: Robot) -> None:

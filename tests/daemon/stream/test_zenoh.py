@@ -36,11 +36,13 @@ from whole_system import SENSOR, running_demo
 
 ZENOH = ("-m", "tactomo.cli", "zenoh", "--log-format", "json")
 EXAMPLES = Path(__file__).parents[3] / "deploy/examples"
+Configure = Callable[..., Path]
+Start = Callable[..., LoggedProcess]
 TOUCH = [Contact(1, 10.0, 0.0, 700.0, 0.1, 0.01, 170.0)]
 
 
 @pytest.fixture
-def configuration(tmp_path: Path) -> Callable[..., Path]:
+def configuration(tmp_path: Path) -> Configure:
     """Write a configuration of Zenoh: ``configuration(mode="client", connect={...})``."""
 
     def write(**sections: object) -> Path:
@@ -52,7 +54,7 @@ def configuration(tmp_path: Path) -> Callable[..., Path]:
 
 
 @pytest.fixture
-def desk(tmp_path: Path, configuration: Callable[..., Path]) -> Iterator[zenoh.Session]:
+def desk(tmp_path: Path, configuration: Configure) -> Iterator[zenoh.Session]:
     """A Zenoh session that is a router, at a file; `client` of it connects there."""
     listen = {"endpoints": [f"unixsock-stream/{tmp_path / 'router'}"]}
     session = zenoh.open(zenoh.Config.from_file(str(configuration(mode="router", listen=listen))))
@@ -61,9 +63,7 @@ def desk(tmp_path: Path, configuration: Callable[..., Path]) -> Iterator[zenoh.S
 
 
 @pytest.fixture
-def start(
-    tmp_path: Path, configuration: Callable[..., Path], desk: zenoh.Session
-) -> Iterator[Callable[..., LoggedProcess]]:
+def start(tmp_path: Path, configuration: Configure, desk: zenoh.Session) -> Iterator[Start]:
     """Start a bridge that is a client of `desk`: ``start(*sensors, robot="arm", bind=...)``."""
     started: list[LoggedProcess] = []
     connect = {"endpoints": [f"unixsock-stream/{tmp_path / 'router'}"]}
@@ -98,7 +98,7 @@ class Samples:
 
 
 def test_each_kind_has_its_key_and_its_count(
-    left: FakeSensor, right: FakeSensor, start: Callable[..., LoggedProcess], desk: zenoh.Session
+    left: FakeSensor, right: FakeSensor, start: Start, desk: zenoh.Session
 ) -> None:
     samples = Samples(desk, "tactomo/**")
     start(left, right, robot="arm")
@@ -117,7 +117,7 @@ def test_each_kind_has_its_key_and_its_count(
 
 @pytest.mark.slow
 def test_a_skin_at_rest_is_sent_by_a_heartbeat_and_a_touch_at_once(
-    left: FakeSensor, start: Callable[..., LoggedProcess], desk: zenoh.Session
+    left: FakeSensor, start: Start, desk: zenoh.Session
 ) -> None:
     samples = Samples(desk, "tactomo/arm/left/contacts")
     start(left, robot="arm")
@@ -137,7 +137,7 @@ def test_a_skin_at_rest_is_sent_by_a_heartbeat_and_a_touch_at_once(
 
 @pytest.mark.slow
 def test_a_status_is_sent_when_it_says_something_else_and_its_numbers_are_asked_for(
-    left: FakeSensor, start: Callable[..., LoggedProcess], desk: zenoh.Session, reader: Any
+    left: FakeSensor, start: Start, desk: zenoh.Session, reader: Any
 ) -> None:
     samples = Samples(desk, "tactomo/arm/left/status")
     start(left, robot="arm")
@@ -166,7 +166,7 @@ def test_a_status_is_sent_when_it_says_something_else_and_its_numbers_are_asked_
 
 @pytest.mark.slow
 def test_contacts_of_a_simulated_skin_at_rest_are_sent_by_a_heartbeat(
-    start: Callable[..., LoggedProcess], desk: zenoh.Session
+    start: Start, desk: zenoh.Session
 ) -> None:
     """Behind a real daemon, whose frames differ in all numbers that say nothing new."""
     samples = Samples(desk, f"tactomo/arm/{SENSOR}/contacts")
@@ -181,7 +181,7 @@ def test_contacts_of_a_simulated_skin_at_rest_are_sent_by_a_heartbeat(
 
 
 def test_a_query_gets_the_newest_contacts_and_status(
-    left: FakeSensor, start: Callable[..., LoggedProcess], desk: zenoh.Session
+    left: FakeSensor, start: Start, desk: zenoh.Session
 ) -> None:
     samples = Samples(desk, "tactomo/arm/left/status")
     start(left, robot="arm")
@@ -204,7 +204,7 @@ def test_a_query_gets_the_newest_contacts_and_status(
 
 @pytest.mark.slow
 def test_a_token_lives_as_long_as_the_daemon(
-    left: FakeSensor, start: Callable[..., LoggedProcess], desk: zenoh.Session
+    left: FakeSensor, start: Start, desk: zenoh.Session
 ) -> None:
     heard: list[tuple[str, zenoh.SampleKind]] = []
     tokens = desk.liveliness().declare_subscriber(
@@ -222,7 +222,7 @@ def test_a_token_lives_as_long_as_the_daemon(
 
 @pytest.mark.slow
 def test_clients_of_zeromq_find_all_skins_at_one_address(
-    left: FakeSensor, right: FakeSensor, start: Callable[..., LoggedProcess], reader: Any
+    left: FakeSensor, right: FakeSensor, start: Start, reader: Any
 ) -> None:
     start(left, right, robot="arm")
     address = start(bind="tcp://127.0.0.1:0").address
@@ -249,7 +249,7 @@ def test_clients_of_zeromq_find_all_skins_at_one_address(
 
 
 def test_late_joiners_get_the_last_status_at_once(
-    left: FakeSensor, start: Callable[..., LoggedProcess], reader: Any
+    left: FakeSensor, start: Start, reader: Any
 ) -> None:
     start(left, robot="arm")
     address = start(bind="tcp://127.0.0.1:0", robot="arm").address
@@ -272,7 +272,7 @@ def test_late_joiners_get_the_last_status_at_once(
 
 @pytest.mark.slow
 def test_a_status_of_a_daemon_that_is_gone_is_not_repeated(
-    desk: zenoh.Session, start: Callable[..., LoggedProcess], reader: Any
+    desk: zenoh.Session, start: Start, reader: Any
 ) -> None:
     address = start(bind="tcp://127.0.0.1:0").address
     first = reader(address, topic("left", "status"))
@@ -287,7 +287,7 @@ def test_a_status_of_a_daemon_that_is_gone_is_not_repeated(
 
 
 def test_zenoh_is_asked_for_what_somebody_wants_and_no_longer(
-    desk: zenoh.Session, start: Callable[..., LoggedProcess], reader: Any
+    desk: zenoh.Session, start: Start, reader: Any
 ) -> None:
     publisher: Any = desk.declare_publisher("tactomo/arm/left/contacts")  # typed as not so
 
@@ -304,9 +304,7 @@ def test_zenoh_is_asked_for_what_somebody_wants_and_no_longer(
 
 
 @pytest.mark.slow
-def test_a_slow_subscriber_slows_nobody(
-    desk: zenoh.Session, start: Callable[..., LoggedProcess], reader: Any
-) -> None:
+def test_a_slow_subscriber_slows_nobody(desk: zenoh.Session, start: Start, reader: Any) -> None:
     running = start(bind="tcp://127.0.0.1:0")
     counts, image = iter(range(1, 10_000)), bytes(640_000)
 
@@ -325,9 +323,7 @@ def test_a_slow_subscriber_slows_nobody(
 
 
 @pytest.mark.slow
-def test_a_source_that_never_answered_is_missed_once(
-    tmp_path: Path, start: Callable[..., LoggedProcess]
-) -> None:
+def test_a_source_that_never_answered_is_missed_once(tmp_path: Path, start: Start) -> None:
     with FakeSensor("left", f"ipc://{tmp_path}/left") as left:  # a port may be another's meanwhile
         pass
     running = start(left)
@@ -339,7 +335,7 @@ def test_a_source_that_never_answered_is_missed_once(
 
 
 def test_a_web_pages_subscription_gets_nothing(
-    desk: zenoh.Session, start: Callable[..., LoggedProcess], reader: Any
+    desk: zenoh.Session, start: Start, reader: Any
 ) -> None:
     running = start(bind="tcp://127.0.0.1:0")
     one = reader(running.address, b"left/")
@@ -349,7 +345,7 @@ def test_a_web_pages_subscription_gets_nothing(
 
 
 def test_what_is_lost_is_counted_and_told(
-    desk: zenoh.Session, start: Callable[..., LoggedProcess], reader: Any, left: FakeSensor
+    desk: zenoh.Session, start: Start, reader: Any, left: FakeSensor
 ) -> None:
     running = start(bind="tcp://127.0.0.1:0")
     socket = reader(running.address, b"")
@@ -364,7 +360,7 @@ def test_what_is_lost_is_counted_and_told(
 
 @pytest.mark.slow
 def test_two_robots_skins_of_one_name_are_not_mixed(
-    desk: zenoh.Session, start: Callable[..., LoggedProcess], reader: Any, left: FakeSensor
+    desk: zenoh.Session, start: Start, reader: Any, left: FakeSensor
 ) -> None:
     running = start(bind="tcp://127.0.0.1:0")
     one = reader(running.address, topic("left", "contacts"))
@@ -389,7 +385,7 @@ def test_two_robots_skins_of_one_name_are_not_mixed(
 
 
 def test_two_daemons_of_one_name_are_warned_of(
-    left: FakeSensor, start: Callable[..., LoggedProcess], desk: zenoh.Session
+    left: FakeSensor, start: Start, desk: zenoh.Session
 ) -> None:
     samples = Samples(desk, "tactomo/**")
     with FakeSensor("left") as other:
@@ -408,7 +404,7 @@ def test_two_daemons_of_one_name_are_warned_of(
 
 
 @pytest.mark.slow
-def test_a_signal_ends_it(left: FakeSensor, start: Callable[..., LoggedProcess]) -> None:
+def test_a_signal_ends_it(left: FakeSensor, start: Start) -> None:
     for running in (start(left), start(bind="tcp://127.0.0.1:0")):
         running.process.send_signal(signal.SIGTERM)
         assert running.process.wait(PATIENCE_S) == 0
@@ -503,7 +499,7 @@ def test_the_examples_let_a_listed_certificate_read_and_no_more(
 
 
 def test_the_pages_program_prints_touches_and_who_is_there(
-    left: FakeSensor, configuration: Callable[..., Path], tmp_path: Path
+    left: FakeSensor, configuration: Configure, tmp_path: Path
 ) -> None:
     page = Page("docs/fleet.md")
     assert "tactomo zenoh --from tcp://127.0.0.1:5560 --robot arm" in page.commands()
@@ -553,7 +549,7 @@ def test_the_pages_program_prints_touches_and_who_is_there(
     ],
 )
 def test_what_cannot_be_done_says_why(
-    arguments: list[str], status: int, said: str, configuration: Callable[..., Path]
+    arguments: list[str], status: int, said: str, configuration: Configure
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as busy:
         endpoint = f"tcp/127.0.0.1:{busy.getsockname()[1]}"
