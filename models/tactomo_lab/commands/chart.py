@@ -69,7 +69,7 @@ def chart(
         f"Simulated, not measured on hardware: sensor {name}, reporting seeds; presses of mixed "
         f"kinds on skins made by hand\n{count} still scenes each of 1 to 4 contacts, "
         f"{moving_scenes} moving scene{'s' * (moving_scenes > 1)}; one thread of\n{machine}\n"
-        "figures at points: budget of modelled work; pale: something else is both faster and better"
+        "sizes of markers: budget of modelled work; pale: another point is both faster and better"
     )
     save_figure(draw_chart(points, title), picture)
     say(f"wrote {picture} and {table_path(picture)}", err=True)

@@ -1,9 +1,13 @@
-"""The picture of `tactomo bench --chart`: accuracy over time per frame, a panel for each noise."""
+"""The picture of `tactomo bench --chart`: accuracy over time per frame, a panel for each noise.
+
+All words stand beside the panels, so that none lies over a point or another word: the legend says
+which marker is which method, which size is which budget, and what the lines are.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import cycle, groupby
+from itertools import cycle
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -21,21 +25,25 @@ COLOURS: Final = (
     *("#CC79A7", "#E69F00", "#7A4FBF", "#8C6D31", "#808080", "#00A5B5", "#A50F3C"),
 )
 MARKERS: Final = "oDsXPv^*<>hp"
-MARKER: Final = 7.0  # points of print, across
+MARKER: Final = 7.0  # points of print, across, of methods without a budget
+MARKERS_OF_BUDGETS: Final = (4.0, 10.0)  # likewise, of the least and the most work
 PALE: Final = 0.35  # opacity of what something else is better than
-FRONT: Final = "0.45"
+FRONT: Final[dict[str, Any]] = {"color": "0.45", "linewidth": 1.5}
 Style = tuple[str, str]  # colour and marker
+Sizes = dict[float | None, float]  # of markers, by budget in seconds
 ICC_TICKS: Final = (-0.5, 0, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.998)
 MAX_ICC: Final = 0.9995  # drawn there if it is more
 PAPER_MS: Final = 6000.0  # the paper, section V: whole tomography, hardware; it prints no ICC
+PAPER: Final[dict[str, Any]] = {"color": "0.6", "linestyle": ":", "linewidth": 1}
 FRAME_MS: Final = 50.0  # between two scans at 20 a second
+FRAME: Final[dict[str, Any]] = {"color": "0.6", "linestyle": "--", "linewidth": 1}
 
 
 def draw_chart(points: Sequence[Point], title: str) -> Figure:
     """Draw a panel for each kind of scene and noise."""
     from matplotlib.figure import Figure
 
-    groups, styles = list(panels(points)), _styles(points)
+    groups, styles, sizes = list(panels(points)), _styles(points), _sizes(points)
     columns = 2 if len(groups) > 1 else 1
     rows = -(-len(groups) // columns)
     figure = Figure(figsize=(5.5 * columns, 0.7 + 4.0 * rows), layout="constrained")
@@ -44,84 +52,60 @@ def draw_chart(points: Sequence[Point], title: str) -> Figure:
     for axes in grid.flat[len(groups) :]:
         axes.set_visible(False)
     for axes, panel in zip(grid.flat, groups, strict=False):
-        _draw_panel(axes, panel, styles)
+        _draw_panel(axes, panel, styles, sizes)
     _set_axes(grid, points)
-    _name_methods(figure, points, styles)
-    _part_labels(figure, grid)
+    _add_legend(figure, points, styles, sizes)
     return figure
 
 
-def _part_labels(figure: Figure, grid: Any) -> None:
-    """Move labels down until none lies over another one of its panel."""
-    figure.draw_without_rendering()
-    for axes in grid.flat:
-        placed: list[Any] = []
-        for label in sorted(axes.texts, key=lambda text: -text.get_window_extent().y1):
-            while any(label.get_window_extent().overlaps(other) for other in placed):
-                if not isinstance(label.get_gid(), str):  # of a line or a front: stays there
-                    break
-                x, y = label.get_position()
-                label.set_position((x, y - label.get_fontsize() - 1))
-            placed.append(label.get_window_extent())
-
-
-def _name_methods(figure: Figure, points: Sequence[Point], styles: dict[str, Style]) -> None:
-    """Say below the panels which marker is which method."""
+def _add_legend(
+    figure: Figure, points: Sequence[Point], styles: dict[str, Style], sizes: Sizes
+) -> None:
+    """Say below the panels what markers, their sizes and lines are."""
     from matplotlib.lines import Line2D
 
     measured = {point.variant.method for point in points}
-    handles = [
-        Line2D([], [], color=colour, marker=marker, label=method)
+    methods = [
+        Line2D([], [], color=colour, marker=marker, markersize=MARKER, label=method)
         for method, (colour, marker) in styles.items()
         if method in measured
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8)
+    names = {p.variant.budget_s: p.variant.budget_name for p in points}
+    budgets = [
+        Line2D([], [], color="0.5", marker="o", markersize=size, linewidth=0, label=names[budget])
+        for budget, size in sizes.items()
+        if budget is not None
+    ]
+    lines = [Line2D([], [], **FRONT, label="Pareto front")]
+    if any(point.scene == "moving" for point in points):
+        lines.append(Line2D([], [], **FRAME, label="next scan, 20 a second"))
+    lines.append(Line2D([], [], **PAPER, label="the paper: 6 s, hardware, no ICC"))
+    handles = [*methods, *budgets, *lines]
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8)
 
 
-def _draw_panel(axes: Any, panel: Sequence[Point], styles: dict[str, Style]) -> None:
+def _draw_panel(axes: Any, panel: Sequence[Point], styles: dict[str, Style], sizes: Sizes) -> None:
     front = pareto_front(panel)
-    _draw_time(axes, PAPER_MS, "the paper: 6 s a frame, hardware, no ICC given")
+    axes.axvline(PAPER_MS, **PAPER)
     if panel[0].scene == "moving":
-        _draw_time(axes, FRAME_MS, "next scan at 20 a second")
+        axes.axvline(FRAME_MS, **FRAME)
     if front:
         x, y = [p.p50_s * 1e3 for p in front], [p.icc for p in front]
-        axes.step([*x, PAPER_MS], [*y, y[-1]], where="post", color=FRONT, linewidth=1.5, zorder=1)
-        axes.annotate(
-            "Pareto front ",
-            (PAPER_MS, y[-1]),
-            xytext=(-10, 3),
-            textcoords="offset points",
-            ha="right",
-            fontsize=7,
-            color=FRONT,
-        )
+        axes.step([*x, PAPER_MS], [*y, y[-1]], where="post", zorder=1, **FRONT)
     for method in dict.fromkeys(point.variant.method for point in panel):
-        _draw_method(axes, [p for p in panel if p.variant.method == method], front, styles)
+        _draw_method(axes, [p for p in panel if p.variant.method == method], front, styles, sizes)
     kind = "Still scenes, cold start" if panel[0].scene == "still" else "Moving scenes, 20 frames/s"
     axes.set_title(f"{kind}: {panel[0].snr_db:g} dB signal to noise", fontsize=10)
 
 
-def _draw_time(axes: Any, ms: float, what: str) -> None:
-    """Mark a time that is worth comparing with."""
-    axes.axvline(ms, color="0.6", linestyle=":", linewidth=1)
-    axes.annotate(
-        what,
-        (ms, 0.02),
-        xytext=(-1, 0),
-        xycoords=axes.get_xaxis_transform(),
-        textcoords="offset points",
-        rotation=90,
-        ha="right",
-        va="bottom",
-        fontsize=6.5,
-        color="0.4",
-    )
-
-
 def _draw_method(
-    axes: Any, series: Sequence[Point], front: Sequence[Point], styles: dict[str, Style]
+    axes: Any,
+    series: Sequence[Point],
+    front: Sequence[Point],
+    styles: dict[str, Style],
+    sizes: Sizes,
 ) -> None:
-    """Draw a method's points, joined from its smallest budget to its largest, with the budgets."""
+    """Draw a method's points, joined from its smallest budget to its largest."""
     colour, marker = styles[series[0].variant.method]
     axes.plot(
         [p.p50_s * 1e3 for p in series],
@@ -139,31 +123,11 @@ def _draw_method(
             xerr=[[0.0], [max(0.0, point.summary.seconds_99 - point.p50_s) * 1e3]],
             color=colour,
             marker=marker,
-            markersize=MARKER if best else 0.7 * MARKER,
+            markersize=sizes[point.variant.budget_s],
             elinewidth=1,
             capsize=2,
             alpha=1.0 if best else PALE,
             zorder=4 if best else 3,
-        )
-    if len(series) > 1:
-        _name_budgets(axes, series, colour)
-
-
-def _name_budgets(axes: Any, series: Sequence[Point], colour: str) -> None:
-    """Write budgets below points: one range for budgets in a row whose ICC prints alike."""
-    for _, alike in groupby(series, key=lambda point: f"{point.icc:.3f}"):
-        first, *others = alike
-        names = [first.variant.budget_name, *(p.variant.budget_name for p in others[-1:])]
-        axes.annotate(
-            " to ".join(names),
-            (first.p50_s * 1e3, _shown(first.icc)),
-            xytext=(0, -MARKER),
-            textcoords="offset points",
-            ha="center",
-            va="top",
-            fontsize=6,
-            color=colour,
-            gid="budget",
         )
 
 
@@ -171,6 +135,13 @@ def _styles(points: Sequence[Point]) -> dict[str, Style]:
     """Colours and markers of methods: ours and installed ones keep theirs on every chart."""
     methods = dict.fromkeys((*available_methods(), *(point.variant.method for point in points)))
     return dict(zip(methods, cycle(zip(COLOURS, MARKERS, strict=True)), strict=False))
+
+
+def _sizes(points: Sequence[Point]) -> Sizes:
+    """Sizes of markers: the more work a budget allows, the larger."""
+    budgets = sorted({p.variant.budget_s for p in points if p.variant.budget_s is not None})
+    across = np.linspace(*MARKERS_OF_BUDGETS, len(budgets))
+    return {None: MARKER, **dict(zip(budgets, across.tolist(), strict=True))}
 
 
 def _shown(icc: float) -> float:
@@ -193,18 +164,9 @@ def _set_axes(grid: Any, points: Sequence[Point]) -> None:
         axes.minorticks_off()
         axes.grid(alpha=0.25)
     for axes in grid[-1]:
-        axes.set_xlabel("time per frame (ms): p50, whisker to p99")
+        axes.set_xlabel("time per frame (ms), less is better: p50, whisker to p99")
     for axes in grid[:, 0]:
-        axes.set_ylabel("ICC with the true map, mean")
-    grid[0, 0].annotate(
-        "better",
-        xy=(0.02, 0.98),
-        xytext=(0.12, 0.88),
-        xycoords="axes fraction",
-        color="0.4",
-        fontsize=9,
-        arrowprops={"arrowstyle": "->", "color": "0.4"},
-    )
+        axes.set_ylabel("mean ICC with the true map, more is better")
 
 
 def _stretch(icc: FloatArray) -> FloatArray:
