@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from noisy_skin import Skin
@@ -10,6 +12,7 @@ from small_sensor import SMALL
 from tactomo_models import (
     Artifact,
     Reconstructor,
+    Reference,
     SensorDescription,
     SkinSimulator,
     load_description,
@@ -19,6 +22,8 @@ from tactomo_models.physics.bare_sheet import solve_bare_sheet
 from tactomo_models.physics.compiled_sheet import CompiledSheet
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import mesh_sheet
+
+Tared = Callable[..., Reconstructor]
 
 
 @pytest.fixture(scope="session")
@@ -61,11 +66,21 @@ def skin(simulator: SkinSimulator) -> Skin:
 
 
 @pytest.fixture
-def reconstructor(paper: SensorDescription, artifact: Artifact, skin: Skin) -> Reconstructor:
+def tared(paper: SensorDescription, artifact: Artifact, skin: Skin) -> Tared:
+    """Make a reconstructor of the paper's sensor: ``tared(on=skin, method="network")``."""
+
+    def make(reference: Reference | None = None, *, on: Skin = skin, **how: Any) -> Reconstructor:
+        made = Reconstructor(paper, artifact, **how)
+        made.set_reference(on.reference() if reference is None else reference)
+        return made
+
+    return make
+
+
+@pytest.fixture
+def reconstructor(tared: Tared) -> Reconstructor:
     """Tared on the unpressed skin."""
-    made = Reconstructor(paper, artifact)
-    made.set_reference(skin.reference())
-    return made
+    return tared()
 
 
 @pytest.fixture

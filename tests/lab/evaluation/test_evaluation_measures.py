@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from made_score import made_score
 from tactomo_lab.scenes.measures import (
     MATCH_M,
     ContactScore,
@@ -79,32 +80,9 @@ def test_a_contact_is_scored_in_the_units_it_says(paper: SensorDescription) -> N
 
 
 def scene(paper: SensorDescription, *found: Contact | None, **other: object) -> Score:
-    one = Score(
-        scene="tuning 1/0",
-        phase="",
-        groups=len(found),
-        countable=True,
-        switches=0,
-        wrong=False,
-        contacts=tuple(score_contact(paper, TRUE, contact) for contact in found),
-        found=sum(contact is not None for contact in found),
-        rie=0.2,
-        icc=0.9,
-        icc_structure=0.95,
-        flags=(),
-        distrusted=False,
-        has_map=True,
-        tier="levelset",
-        reason="",
-        misfit=1.0,
-        confidence=float("nan"),
-        seconds=0.1,
-        shape="ellipse",
-        contrast=30.0,
-        opposite=False,
-        snr_db=40.0,
-    )
-    made = replace(one, **other)  # type: ignore[arg-type]
+    contacts = tuple(score_contact(paper, TRUE, contact) for contact in found)
+    known = {"contacts": contacts, "groups": len(found), "tier": "levelset"}
+    made = made_score(**known | {"found": sum(c is not None for c in found)} | other)
     return replace(made, wrong=made.icc < 0.8)
 
 

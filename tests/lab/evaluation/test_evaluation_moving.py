@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from made_score import made_score
 from tactomo_lab.evaluation.moving import (
     INDENTERS,
     Step,
@@ -161,31 +162,8 @@ def test_a_tare_forgets_who_was_who(paper: SensorDescription, simulator: SkinSim
 
 
 def frame(phase: str, icc: float, found: int = 1, distrusted: bool = False) -> Score:
-    return Score(
-        scene="tuning 1/0",
-        phase=phase,
-        contacts=(),
-        found=found,
-        groups=1,
-        countable=True,
-        switches=0,
-        rie=1 - icc,
-        icc=icc,
-        icc_structure=icc,
-        flags=(),
-        distrusted=distrusted,
-        wrong=icc < 0.8,
-        has_map=True,
-        tier="fit",
-        reason="",
-        confidence=1.0,
-        misfit=1.0,
-        seconds=0.01,
-        shape="ellipse",
-        contrast=100.0,
-        opposite=False,
-        snr_db=40.0,
-    )
+    told = {"phase": phase, "found": found, "distrusted": distrusted, "wrong": icc < 0.8}
+    return made_score(**told, rie=1 - icc, icc=icc, icc_structure=icc)
 
 
 def test_phases_by_hand() -> None:

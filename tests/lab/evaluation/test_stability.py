@@ -7,6 +7,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from made_score import made_score
 from tactomo_lab.evaluation.play import Played, Player, Variant
 from tactomo_lab.evaluation.regimes import KINDS, REGIMES, draw_plan, make_case
 from tactomo_lab.evaluation.stability import (
@@ -19,7 +20,6 @@ from tactomo_lab.evaluation.stability import (
 )
 from tactomo_lab.scenes.case import Case, Plan
 from tactomo_lab.scenes.drawing import BOTH_CHANNELS, gap_m, outline_of
-from tactomo_lab.scenes.measures import Score
 from tactomo_lab.scenes.simulation import (
     SheetState,
     UnevenSkin,
@@ -310,32 +310,7 @@ def test_what_is_right_where_the_magnitude_channel_shows_nothing(small: SensorDe
 
 
 def one(icc: float, flags: tuple[str, ...] = (), has_map: bool = True) -> Judged:
-    score = Score(
-        scene="tuning 1/0",
-        phase="",
-        contacts=(),
-        found=1,
-        groups=1,
-        countable=True,
-        switches=0,
-        rie=0.2,
-        icc=icc,
-        icc_structure=icc,
-        flags=flags,
-        distrusted=False,
-        wrong=False,
-        has_map=has_map,
-        tier="fit",
-        reason="",
-        misfit=1.0,
-        confidence=float("nan"),
-        seconds=0.1,
-        shape="ellipse",
-        contrast=30.0,
-        opposite=False,
-        snr_db=40.0,
-    )
-    return Judged("a", "auto", score)
+    return Judged("a", "auto", made_score(icc=icc, icc_structure=icc, flags=flags, has_map=has_map))
 
 
 def test_warnings_are_counted() -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from model_fixtures import Tared
 from noisy_skin import Skin
 from tactomo_lab.scenes.measures import correlation
 from tactomo_lab.scenes.simulation import truth_of
 from tactomo_models import (
-    Artifact,
     Flag,
     Press,
     Reconstruction,
@@ -28,13 +28,9 @@ BALL = Press(-0.02, -0.01, 250.0, radius_m=0.02, profile="dome")
 
 
 @pytest.fixture
-def methods(paper: SensorDescription, artifact: Artifact, skin: Skin) -> dict[str, Reconstructor]:
+def methods(tared: Tared, skin: Skin) -> dict[str, Reconstructor]:
     reference = skin.reference()
-    made = {}
-    for tier in ("fit", "auto"):
-        made[tier] = Reconstructor(paper, artifact, method=tier, budget_s=2.0)
-        made[tier].set_reference(reference)
-    return made
+    return {tier: tared(reference, method=tier, budget_s=2.0) for tier in ("fit", "auto")}
 
 
 def icc(paper: SensorDescription, frame: Reconstruction, *presses: Press) -> float:
@@ -56,7 +52,7 @@ def test_a_cold_start_takes_fewer_solves_from_a_proposal(
 
 @pytest.mark.parametrize("pressure_kpa", [6.0, 20.0, 180.0])
 def test_where_time_ends_before_any_contact_was_tried_the_network_stands_in(
-    paper: SensorDescription, methods: dict[str, Reconstructor], skin: Skin, pressure_kpa: float
+    methods: dict[str, Reconstructor], skin: Skin, pressure_kpa: float
 ) -> None:
     """What is proposed may begin further from the data than nothing does."""
     made = methods["auto"]

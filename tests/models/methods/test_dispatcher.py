@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from model_fixtures import Tared
 from noisy_skin import Skin
 from tactomo_models import (
-    Artifact,
     Channel,
     Estimate,
     Measurement,
     Press,
     Reconstructor,
     Reference,
-    SensorDescription,
 )
 from tactomo_models import Skin as PreparedSkin
 
@@ -63,19 +62,9 @@ class Unprepared(Smooth):
         raise KeyError("weights")
 
 
-def with_method(
-    paper: SensorDescription, artifact: Artifact, skin: Skin, method: Smooth
-) -> Reconstructor:
-    reconstructor = Reconstructor(paper, artifact, method=method)
-    reconstructor.set_reference(skin.reference())
-    return reconstructor
-
-
-def test_a_map_and_a_structure_suffice(
-    paper: SensorDescription, artifact: Artifact, skin: Skin
-) -> None:
+def test_a_map_and_a_structure_suffice(tared: Tared, skin: Skin) -> None:
     method = Smooth()
-    reconstructor = with_method(paper, artifact, skin, method)
+    reconstructor = tared(method=method)
     frame = reconstructor.reconstruct(**skin.scan(PRESS))
     assert (frame.tier, frame.reason, frame.failure) == ("Smooth", "as requested", "")
     assert frame.map is not None
@@ -86,13 +75,11 @@ def test_a_map_and_a_structure_suffice(
     assert np.isnan(contact.pressure_kpa), "of a magnitude whose uncertainty is not known"
 
 
-def test_with_an_uncertainty_magnitudes_become_pressures(
-    paper: SensorDescription, artifact: Artifact, skin: Skin
-) -> None:
+def test_with_an_uncertainty_magnitudes_become_pressures(tared: Tared, skin: Skin) -> None:
     blank = np.zeros((51, 51))
     blank[20:26, 30:36] = 1.0
     made = Estimate(map=0.15 * blank, structure=blank, magnitude_sigmas=0.01)
-    frame = with_method(paper, artifact, skin, Answering(made)).reconstruct(**skin.scan(PRESS))
+    frame = tared(method=Answering(made)).reconstruct(**skin.scan(PRESS))
     (contact,) = frame.contacts
     assert contact.magnitude == pytest.approx(0.15)
     assert 140 < contact.pressure_kpa < 200
@@ -100,11 +87,9 @@ def test_with_an_uncertainty_magnitudes_become_pressures(
     assert frame.pressure_kpa.max() == pytest.approx(contact.pressure_kpa)
 
 
-def test_it_goes_on_from_its_last_estimate_until_nothing_presses(
-    paper: SensorDescription, artifact: Artifact, skin: Skin
-) -> None:
+def test_it_goes_on_from_its_last_estimate_until_nothing_presses(tared: Tared, skin: Skin) -> None:
     method = Smooth()
-    reconstructor = with_method(paper, artifact, skin, method)
+    reconstructor = tared(method=method)
     for presses in ((PRESS,), (PRESS,), (), (PRESS,)):
         reconstructor.reconstruct(**skin.scan(*presses))
     assert [previous is not None for previous in method.previous] == [False, True, False]
@@ -115,10 +100,8 @@ def test_it_goes_on_from_its_last_estimate_until_nothing_presses(
     assert method.previous[-1] is None
 
 
-def test_one_that_cannot_be_prepared_is_named_in_every_frame(
-    paper: SensorDescription, artifact: Artifact, skin: Skin
-) -> None:
-    reconstructor = with_method(paper, artifact, skin, Unprepared())
+def test_one_that_cannot_be_prepared_is_named_in_every_frame(tared: Tared, skin: Skin) -> None:
+    reconstructor = tared(method=Unprepared())
     frame = reconstructor.reconstruct(**skin.scan(PRESS))
     assert frame.tier == "tikhonov"
     assert "Unprepared failed to prepare: KeyError" in frame.failure
@@ -136,15 +119,12 @@ def test_a_fault_of_ours_is_no_failure_of_the_users(
 
 
 @pytest.mark.slow
-def test_a_reference_of_one_scan_is_as_good_as_its_noise(
-    paper: SensorDescription, artifact: Artifact, skin: Skin
-) -> None:
+def test_a_reference_of_one_scan_is_as_good_as_its_noise(tared: Tared, skin: Skin) -> None:
     """It may be the mean of many: the first frame tells how noisy a scan is."""
     rest = skin.reference()
     assert rest.magnitude is not None
     assert rest.structure is not None
-    reconstructor = Reconstructor(paper, artifact)
-    reconstructor.set_reference(Reference.from_scans(rest.magnitude[None], rest.structure[None]))
+    reconstructor = tared(Reference.from_scans(rest.magnitude[None], rest.structure[None]))
     quiet = [reconstructor.reconstruct(**skin.scan()) for _ in range(3)]
     assert {(frame.tier, int(frame.flags)) for frame in quiet} == {("quiet", 0)}
     pressed = reconstructor.reconstruct(**skin.scan(PRESS))

@@ -11,9 +11,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from model_fixtures import Tared
 from noisy_skin import Skin
 from tactomo_models import (
-    Artifact,
     Channel,
     Flag,
     Press,
@@ -37,12 +37,6 @@ OTHER = Press(-0.03, 0.03, 170.0)
 @pytest.fixture
 def rest(skin: Skin) -> Reference:
     return skin.reference()
-
-
-def tared(paper: SensorDescription, artifact: Artifact, reference: Reference) -> Reconstructor:
-    made = Reconstructor(paper, artifact)
-    made.set_reference(reference)
-    return made
 
 
 def frames(
@@ -124,17 +118,12 @@ def test_a_magnitude_that_no_contact_explains_is_flagged(
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 0.0])
 @pytest.mark.parametrize("noise", ["known", "unknown"])
 def test_a_reference_with_a_bad_voltage_still_serves(
-    paper: SensorDescription,
-    artifact: Artifact,
-    skin: Skin,
-    rest: Reference,
-    bad: float,
-    noise: str,
+    tared: Tared, skin: Skin, rest: Reference, bad: float, noise: str
 ) -> None:
     assert rest.structure is not None
-    structure = np.where(np.arange(paper.measurements) == 17, bad, rest.structure)
+    structure = np.where(np.arange(len(rest.structure)) == 17, bad, rest.structure)
     given = (rest.magnitude_noise, rest.structure_noise, rest.scans) if noise == "known" else ()
-    reconstructor = tared(paper, artifact, Reference(rest.magnitude, structure, *given))
+    reconstructor = tared(Reference(rest.magnitude, structure, *given))
     frame = frames(reconstructor, skin, PRESS)[-1]
     assert Flag.INVALID_VOLTAGE in frame.flags
     (contact,) = frame.contacts
@@ -142,11 +131,9 @@ def test_a_reference_with_a_bad_voltage_still_serves(
 
 
 @pytest.mark.parametrize("value", [math.nan, 0.0])
-def test_a_reference_of_nothing_gives_no_map(
-    paper: SensorDescription, artifact: Artifact, skin: Skin, value: float
-) -> None:
-    nothing = np.full(paper.measurements, value)
-    for frame in frames(tared(paper, artifact, Reference(nothing, nothing)), skin, PRESS, count=2):
+def test_a_reference_of_nothing_gives_no_map(tared: Tared, skin: Skin, value: float) -> None:
+    nothing = np.full(208, value)
+    for frame in frames(tared(Reference(nothing, nothing)), skin, PRESS, count=2):
         assert frame.map is None
         assert frame.structure is None
         assert Flag.MAGNITUDE_MISSING | Flag.STRUCTURE_MISSING in frame.flags
@@ -155,10 +142,10 @@ def test_a_reference_of_nothing_gives_no_map(
 @pytest.mark.slow
 @pytest.mark.parametrize("noise_share", [1e-4, 1e-3])
 def test_what_is_quiet_has_no_misfit_that_would_be_flagged(
-    paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator, noise_share: float
+    tared: Tared, simulator: SkinSimulator, noise_share: float
 ) -> None:
     skin = Skin(simulator, noise_share)
-    reconstructor = tared(paper, artifact, skin.reference())
+    reconstructor = tared(on=skin)
 
     def drift(scans: Scans) -> Scans:
         return {name: 1.003 * volts for name, volts in scans.items()}

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from model_fixtures import Tared
 from noisy_skin import Skin
 from tactomo_models import (
-    Artifact,
     ArtifactError,
     Flag,
     Press,
@@ -162,17 +162,14 @@ def test_a_users_own_network_goes_before_the_shipped_one(
 
 def test_auto_does_without_a_network_that_is_damaged(
     paper: SensorDescription,
-    artifact: Artifact,
-    simulator: SkinSimulator,
+    tared: Tared,
+    skin: Skin,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("CACHE_DIRECTORY", str(tmp_path))
     own_path(paper, "network").write_bytes(b"damaged")
-    skin = Skin(simulator)
-    reconstructor = Reconstructor(paper, artifact, budget_s=1.0)
-    reconstructor.set_reference(skin.reference())
-    frame = reconstructor.reconstruct(**skin.scan(ONE))
+    frame = tared(budget_s=1.0).reconstruct(**skin.scan(ONE))
     assert frame.tier == "fit"
     assert "no network: " in frame.reason
     assert len(frame.contacts) == 1
@@ -180,16 +177,9 @@ def test_auto_does_without_a_network_that_is_damaged(
 
 @pytest.mark.parametrize(("method", "tier"), [("network", "network"), ("auto", "fit")])
 def test_contacts_are_found_where_they_press(
-    paper: SensorDescription,
-    artifact: Artifact,
-    simulator: SkinSimulator,
-    method: str,
-    tier: str,
+    tared: Tared, skin: Skin, method: str, tier: str
 ) -> None:
-    skin = Skin(simulator)
-    reconstructor = Reconstructor(paper, artifact, method=method, budget_s=1.0)
-    reconstructor.set_reference(skin.reference())
-    frame = reconstructor.reconstruct(**skin.scan(*THREE))
+    frame = tared(method=method, budget_s=1.0).reconstruct(**skin.scan(*THREE))
     assert frame.tier == tier
     assert 0 <= frame.confidence <= 1 or method == "auto"
     assert len(frame.contacts) == 3
@@ -200,13 +190,9 @@ def test_contacts_are_found_where_they_press(
 
 
 def test_a_missing_structure_scan_leaves_a_map_and_a_missing_magnitude_scan_a_shape(
-    paper: SensorDescription,
-    artifact: Artifact,
-    simulator: SkinSimulator,
+    tared: Tared, skin: Skin
 ) -> None:
-    skin = Skin(simulator)
-    reconstructor = Reconstructor(paper, artifact, method="network")
-    reconstructor.set_reference(skin.reference())
+    reconstructor = tared(method="network")
     scans = skin.scan(ONE)
     without = reconstructor.reconstruct(scans["magnitude"], None)
     assert without.map is not None
@@ -232,13 +218,9 @@ def test_runs_do_not_depend_on_what_ran_before(shipped: Path, paper: SensorDescr
         assert one.confidence == other.confidence
 
 
-def test_a_dead_electrode_costs_little(
-    paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator
-) -> None:
+def test_a_dead_electrode_costs_little(tared: Tared, skin: Skin, paper: SensorDescription) -> None:
     """Its voltages are filled in from the others: the map stays, as it would not from zeros."""
-    skin = Skin(simulator)
-    reconstructor = Reconstructor(paper, artifact, method="network")
-    reconstructor.set_reference(skin.reference())
+    reconstructor = tared(method="network")
     whole = reconstructor.reconstruct(**skin.scan(*THREE))
     scans = skin.scan(*THREE)
     ends = np.hstack([paper.pairs.drive, paper.pairs.measure])
@@ -251,12 +233,10 @@ def test_a_dead_electrode_costs_little(
     assert Flag.INVALID_VOLTAGE in broken.flags or Flag.ELECTRODE_FAULT in broken.flags
 
 
-def test_the_reference_may_change_between_frames(
-    paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator
-) -> None:
+def test_the_reference_may_change_between_frames(tared: Tared, simulator: SkinSimulator) -> None:
     """The filter follows the noise that each tare has seen."""
     quiet, noisy = Skin(simulator, 3e-4), Skin(simulator, 1e-2)
-    reconstructor = Reconstructor(paper, artifact, method="network")
+    reconstructor = tared(method="network")
     shown = []
     for skin in (quiet, noisy, quiet):
         reconstructor.set_reference(skin.reference())

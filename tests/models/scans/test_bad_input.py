@@ -19,11 +19,11 @@ import pytest
 from faulty_skin import BAD_LEADS, rewired, shorted, touches
 from hypothesis import given
 from hypothesis import strategies as st
+from model_fixtures import Tared
 from noisy_skin import Skin, rms
 from shared_data import measured
 from tactomo_lab.scenes.faults import with_lead
 from tactomo_models import (
-    Artifact,
     Flag,
     Press,
     Reconstruction,
@@ -52,13 +52,8 @@ LEAD = 9
 class Show:
     """A skin, its tare, and what is shown of its scans."""
 
-    def __init__(self, paper: SensorDescription, artifact: Artifact, skin: Skin) -> None:
-        self.paper, self.artifact, self.skin = paper, artifact, skin
-
-    def tared(self, reference: Reference, budget_s: float | None = None) -> Reconstructor:
-        made = Reconstructor(self.paper, self.artifact, budget_s=budget_s)
-        made.set_reference(reference)
-        return made
+    def __init__(self, paper: SensorDescription, tared: Tared, skin: Skin) -> None:
+        self.paper, self.tared, self.skin = paper, tared, skin
 
     def __call__(
         self,
@@ -77,8 +72,8 @@ class Show:
 
 
 @pytest.fixture
-def show(paper: SensorDescription, artifact: Artifact, skin: Skin) -> Show:
-    return Show(paper, artifact, skin)
+def show(paper: SensorDescription, tared: Tared, skin: Skin) -> Show:
+    return Show(paper, tared, skin)
 
 
 def reference_of(skin: Skin, change: Change, *presses: Press) -> Reference:
@@ -328,7 +323,7 @@ def test_clean_scenes_have_no_flag(show: Show, simulator: SkinSimulator) -> None
     rng = np.random.default_rng(6)
     for noise_share in (1e-3, 1e-2):
         skin = Skin(simulator, noise_share)
-        reconstructor = show.tared(skin.reference(), budget_s=1e-3)
+        reconstructor = show.tared(on=skin, budget_s=1e-3)
         for count in np.tile(np.arange(5), 3):
             presses = [
                 Press(float(x), float(y), rng.uniform(60, 200), rng.uniform(0.008, 0.02))
