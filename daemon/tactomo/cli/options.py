@@ -111,7 +111,7 @@ def _protocol(default: str = "") -> Any:
 
 
 def _description(default: str = "") -> Any:
-    words = f"What the sensor is made of: a shipped name or a TOML file.{default}"
+    words = f"Sensor description: a shipped name or a TOML file.{default}"
     return typer.Option("--description", "-d", help=words, autocompletion=description_names)
 
 
@@ -154,13 +154,11 @@ NewName: TypeAlias = Annotated[
 ]
 ServeStream: TypeAlias = Annotated[
     str | None,
-    typer.Option("--stream", help=f"Where to publish. [{DEFAULT_STREAM}, or the next free]"),
+    typer.Option("--stream", help=f"Address of the stream. [{DEFAULT_STREAM}, or the next free]"),
 ]
 ServeControl: TypeAlias = Annotated[
     str | None,
-    typer.Option(
-        "--control", help=f"Where to take commands. [{DEFAULT_CONTROL}, or the next free]"
-    ),
+    typer.Option("--control", help=f"Address for commands. [{DEFAULT_CONTROL}, or the next free]"),
 ]
 ViewerPort: TypeAlias = Annotated[
     int | None,

@@ -106,16 +106,16 @@ def scenes(
 ) -> None:
     """Reconstruct simulated still scenes, each from a cold start, and compare with the truth.
 
-    Every scene has sheets of its own, uneven by 5 %, uneven electrodes, a contrast of 10 to 100
-    that the reconstruction is not told, and noise of equal size in volts on every voltage. They
-    are simulated on another, finer mesh than the one that reconstructs. The first run simulates
-    (half a second a scene) and keeps the voltages in the cache.
+    Every scene has its own sheets, uneven by 5 %, uneven electrodes, a contrast of 10 to 100 that
+    the reconstruction does not know, and equal noise in volts on every voltage. A finer mesh than
+    the reconstruction's simulates the voltages. The first run simulates (half a second a scene) and
+    keeps the voltages in the cache.
 
     The sensor may have two sheets or one, of any outline. Without a magnitude channel the pressed
     shape counts as the map.
 
-    A frame whose *misfit*, in units of the scans' noise, is above 2 (1.5 over both channels, where
-    an unsure network stands in) is flagged misfit_high; about 1 is good.
+    A frame whose *misfit*, in units of the scans' noise, exceeds 2 has the flag misfit_high (1.5
+    over both channels, where a network with low confidence made the map); about 1 is good.
     """
     from tactomo_models import load_description
 
@@ -206,9 +206,9 @@ def moving(
 ) -> None:
     """Follow simulated contacts that slide, land, lift, jump, merge and split, frame by frame.
 
-    With lost scans and a tare on the way, at 20 frames a second, under the budget that the daemon
-    has. Each sequence has sheets of its own, as in `tactomo evaluate scenes`. The first run
-    simulates (a minute a sequence) and keeps the voltages in the cache.
+    Each sequence has lost scans, a tare and its own sheets (see `tactomo evaluate scenes`), at 20
+    frames a second, under the daemon's budget. The first run simulates (a minute a sequence) and
+    keeps the voltages in the cache.
     """
     from tactomo_models import load_description
 
@@ -268,23 +268,23 @@ def field(
     ] = None,
     as_json: options.JsonOutput = False,
 ) -> None:
-    """Reconstruct what one pressure field has to explain: soft presses, one graded sheet, crowds.
+    """Reconstruct soft presses, crowds, one graded sheet and more, and compare with the truth.
 
-    *ordinary*: one to four contacts, at 40, 20 and 10 dB of the change; the others at 40.
-    *rectangles-rings*: of those shapes alone. *hand-made*: electrodes 1 mm off, contact impedances
-    by 30 %, sheets uneven by 10 %. *soft*: balls of 180 to 300 kPa, at 60 dB of the voltages.
-    *graded*: one sheet alone that answers from 0 kPa on. *crowded*: five or six small contacts;
-    *many*: eight to ten. *mixed*: flat ellipses, rectangles, rings and balls side by side, on
-    skins made by hand, at 60 dB of the voltages. *moving*: a sequence of `tactomo evaluate moving`
-    for every ten scenes, without the frames whose scans are lost. *mixed-moving*: such a sequence
-    of mixed presses that land, glide, change pressure and lift, with noise 40 dB under each
-    frame's change and with noise 60 dB under the voltages. *palm*: one contact of 60 mm or more
-    across and 2 to 200 kPa, which comes in a second to ten minutes while the reference follows.
-    *overload*: one to three presses, the first or all beyond the response table's end. All are
-    simulated as in `tactomo evaluate scenes`, still ones reconstructed from a cold start. The
-    first run simulates (a second a scene, a minute a sequence, 10 s a palm) and keeps the voltages
-    in the cache. Rows that cannot happen to the sensor, as *overload* without a magnitude channel,
-    are left out.
+    *ordinary*: one to four contacts, at 40, 20 and 10 dB of the change; the other rows at 40 dB
+    unless stated. *rectangles-rings*: these shapes alone. *hand-made*: electrodes displaced by 1
+    mm, contact impedances by 30 %, sheets uneven by 10 %. *soft*: balls of 180 to 300 kPa, at 60 dB
+    of the voltages. *graded*: one sheet alone, without an onset. *crowded*: five or six small
+    contacts. *many*: eight to ten contacts. *mixed*: flat ellipses, rectangles, rings and balls
+    side by side, on hand-made skins, at 60 dB of the voltages. *moving*: a sequence of `tactomo
+    evaluate moving` for every ten scenes, without the frames of lost scans. *mixed-moving*: such a
+    sequence of mixed presses that land, glide, change pressure and lift, with noise 40 dB below
+    each frame's change or 60 dB below the voltages. *palm*: one contact at least 60 mm across, of 2
+    to 200 kPa, which comes in a second to ten minutes while the reference follows. *overload*: one
+    to three presses, the first or all beyond the end of the response table. Scenes are simulated as
+    in `tactomo evaluate scenes`; still scenes are reconstructed from a cold start. The first run
+    simulates (a second a scene, a minute a sequence, 10 s a palm) and keeps the voltages in the
+    cache. Rows that the sensor cannot have, such as *overload* without a magnitude channel, are
+    left out.
     """
     from tactomo_models import ModelError, load_description
 
@@ -342,14 +342,14 @@ def drift(
     picture: Picture = None,
     as_json: options.JsonOutput = False,
 ) -> None:
-    """Live through days of a skin that drifts, with baseline tracking and without.
+    """Simulate days of a drifting skin, with and without a reference that follows drift.
 
-    The temperature swings by 10 K over a day and steps by 2 K once, by 2 % of conductivity per
-    kelvin, a tenth of it unevenly; what is pressed creeps by 1 % per decade of time and comes back
-    as slowly; contact impedances wander by 10 %. Presses last from seconds to two hours, a third
-    of them too light for the magnitude channel. A frame comes every 20 s, and two a second while
-    something is pressed or let go; every tenth of the former without tracking. The skin is the
-    twin's. A day takes some minutes.
+    The temperature swings by 10 K over a day and steps by 2 K once; conductivity changes by 2 % per
+    kelvin, a tenth of it unevenly. Pressed places creep by 1 % per decade of time and recover as
+    slowly; contact impedances wander by 10 %. Presses last from seconds to two hours; a third of
+    them are too light for the magnitude channel. There are two frames a second while a press
+    changes, else one every 20 s (without tracking, every tenth of these). The skin is the twin's. A
+    day takes some minutes.
     """
     from tactomo_models import load_description
 
@@ -401,15 +401,15 @@ def stability(
     picture: Annotated[Path | None, picture_option("Draw an overview")] = None,
     as_json: options.JsonOutput = False,
 ) -> None:
-    """Break what reconstruction relies on, one regime at a time, and see whether it is flagged.
+    """Reconstruct scenes in regimes where methods fail, and count bad maps without a flag.
 
-    Noise, small contacts, many contacts, bad leads, drift, a stretched sheet, jumps and more: some
-    simulated cases of each regime, reconstructed by every method. A map is bad where its ICC is
-    below 0.7. What tells not to trust it: the flags misfit_high, not_converged, low_confidence,
-    reference_mismatch, noise_high and channels_swapped, or that there is no map. Regimes that
-    cannot happen to the sensor, as lost structure scans to one sheet, are left out. The first run
-    simulates (a second a case, some more where a case is several frames) and keeps the voltages
-    in the cache.
+    The regimes are noise, small contacts, many contacts, bad leads, drift, a stretched sheet, jumps
+    and more; every method reconstructs some simulated cases of each regime. A map is bad where its
+    ICC is below 0.7. A map counts as flagged if it has one of the flags misfit_high, not_converged,
+    low_confidence, reference_mismatch, noise_high and channels_swapped, or if there is no map.
+    Regimes that the sensor cannot have, such as lost structure scans of one sheet, are left out.
+    The first run simulates (a second a case, longer for several frames) and keeps the voltages in
+    the cache.
     """
     from tactomo_models import available_methods, load_description
 

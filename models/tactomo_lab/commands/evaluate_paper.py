@@ -83,12 +83,12 @@ def paper(
     ] = None,
     as_json: options.JsonOutput = False,
 ) -> None:
-    """Repeat the paper's evaluation on simulated skins, and set its printed numbers beside ours.
+    """Repeat the paper's evaluation on simulated skins, beside the paper's printed numbers.
 
-    Theirs of Figs. 7 to 12 were measured on hardware; ours are simulated, on sheets uneven by 5 %
-    with noise on every voltage. Fig. 5 is simulated there and here: even sheets, ellipses that
-    conduct worse than the sheet, white noise by the rms of the voltage changes. The first run
-    simulates (half a second a scene) and keeps the voltages in the cache.
+    The paper's Figs. 7 to 12 were measured on hardware; tactomo's figures are simulated, on sheets
+    uneven by 5 % with noise on every voltage. Fig. 5 is simulated in both: even sheets, ellipses
+    that conduct worse than the sheet, white noise relative to the rms of the voltage changes. The
+    first run simulates (half a second a scene) and keeps the voltages in the cache.
     """
     from tactomo_models import load_description
 

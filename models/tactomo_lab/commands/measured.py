@@ -244,21 +244,21 @@ def measured(
     ] = None,
     as_json: JsonOutput = False,
 ) -> None:
-    """Measure a set, or every public set that is in DIR beside the best published figure.
+    """Evaluate a measured set, or the public sets in DIR beside the best published figures.
 
-    Prints Markdown. FILE is recognised by its arrays. *Tanks with objects*: `dv` (n, M), by how
-    much each voltage grew when the objects came in, on one unknown scale common to all; `truth`
-    (n, rows, columns), 1 in what conducts better than the saline and -1 in what conducts worse,
-    row 0 at the top, the disc filling the picture; `name` (n,). The figure is the Pearson
-    correlation of the image with the truth over the disc; the network's confidence is the
-    correlation to expect. *Presses of a robot*: `lookup` (M, 4), the source, sink, v+ and v-
-    electrode of each voltage; `dv` (n, M); `pos_m` (n, 2), where it pressed, in its own frame. How
-    the skin lies there is fitted to some presses and judged on others. *Tanks of the Kuopio
-    Tomography Challenge* and *presses on skins of unknown make*: as `tactomo evaluate ktc` and
-    `presses` take them, at every level and after 100, 200 and 800 presses.
+    Prints Markdown. The arrays of FILE tell its kind. *Tanks with objects*: `dv` (n, M), the
+    increase of each voltage by the objects, on one unknown scale common to all; `truth` (n, rows,
+    columns), 1 where an object conducts better than the saline and -1 where worse, row 0 at the
+    top, the disc filling the picture; `name` (n,). The figure is the Pearson correlation of the
+    image with the truth over the disc; the network's confidence is the expected correlation.
+    *Presses of a robot*: `lookup` (M, 4), the source, sink, v+ and v- electrode of each voltage;
+    `dv` (n, M); `pos_m` (n, 2), the places in the robot's frame. Some presses fit the skin's place
+    in that frame, the others judge it. *Tanks of the Kuopio Tomography Challenge* and *presses on
+    unknown skins*: as for `tactomo evaluate ktc` and `presses`, at every level and after 100, 200
+    and 800 presses.
 
-    The public sets: ktc2023_training.npz, tank_uef2017.npz, skin_round_presses.npz and
-    skins_anisotropy.npz; what is missing is said in its row. All four take two minutes of one core.
+    The public sets are ktc2023_training.npz, tank_uef2017.npz, skin_round_presses.npz and
+    skins_anisotropy.npz; the table names missing sets. All four take two minutes of one core.
     """
     if not path.is_dir():
         if into is not None:
@@ -372,16 +372,17 @@ def ktc(
     picture: Picture = None,
     as_json: JsonOutput = False,
 ) -> None:
-    """Segment tanks of the Kuopio Tomography Challenge 2023, and score them as it did.
+    """Segment tanks of the Kuopio Tomography Challenge 2023, and score them by its rules.
 
     FILE holds `injection` (T, 32, 76), the currents of each drive; `measurement` (32, 31), the
     weights of the electrodes' potentials; `reference` and `voltages` (T, 2356), drive by drive, of
-    the empty and the full tank, nan where electrodes are lost; `truth` (T, 256, 256), 0 water, 1
+    the empty and the full tank, NaN where electrodes are lost; `truth` (T, 256, 256), 0 water, 1
     conducts worse, 2 better; and `level` (T,).
 
-    A tank's score is the mean structural similarity of both kinds' images, 1 at best. A network
-    trained on simulated tanks alone makes objects of five linear images, and these are refined
-    until they explain the voltages. Level l of 1 to 7 loses the first 2 (l - 1) electrodes.
+    A tank's score is the mean structural similarity of both kinds' images; 1 is best. A network,
+    trained on simulated tanks alone, turns five linear images into objects, and a level set refines
+    the objects until they explain the voltages. Level l of 1 to 7 loses the first 2 (l - 1)
+    electrodes.
     """
     from tactomo_lab.commands.pictures import draw_tanks
     from tactomo_lab.evaluation.ktc import evaluate_challenge, read_challenge
@@ -421,10 +422,10 @@ def presses(
 ) -> None:
     """Learn each skin from its first presses, and locate its last 800.
 
-    FILE holds for each skin NAME_voltages (P, M), what each press changed, and NAME_xy_mm (P, 2),
-    where it was, both in order of time. Half of the presses not learnt from are judged where they
-    are fewer than 800. What the sheets are made of nobody needs to know: nothing but the presses
-    is learnt from, of each skin by itself.
+    FILE holds for each skin NAME_voltages (P, M), the voltage changes of each press, and NAME_xy_mm
+    (P, 2), the places, both in order of time. If fewer than 800 presses are left after learning,
+    half of the remaining presses are judged. Each skin is learnt from its own presses alone; the
+    sheets' make does not matter.
     """
     from threadpoolctl import threadpool_limits
 

@@ -61,16 +61,15 @@ def simulate(
 ) -> None:
     """Simulate scenes to train networks on: voltages of both channels, and the truth.
 
-    Ctrl-C stops it, and the same command goes on where it stopped; with a larger --scenes a
-    finished set grows. Scenes depend on the preset, the seed and their number alone, whatever
-    makes them, and none is one of `tactomo evaluate`. Reckon with a tenth of a second for each on
-    one core, and 2 MB for a thousand.
+    The same command continues after Ctrl-C; a larger --scenes extends a finished set. Scenes depend
+    only on the preset, the seed and their number, and none is a scene of `tactomo evaluate`. A
+    scene takes a tenth of a second on one core, a thousand scenes take 2 MB.
 
     *paper*: one to four ellipses that do not overlap, 0.75 to 0.95 S/m on an even sheet of 1 S/m,
     100 S/m in the structure channel. *robust*: none to ten contacts of several shapes, flat or
-    soft, lighter and heavier than the range as well; both signs; contrast 10 to 100; sheets up to
-    as uneven as hand-made ones; uneven, displaced and now and then weak electrodes. Noise is added
-    in training.
+    soft, also lighter and heavier than the range; both signs; contrast 10 to 100; sheets up to as
+    uneven as hand-made sheets; uneven, displaced and sometimes weak electrodes. Training adds the
+    noise.
 
     Needs `pip install 'tactomo-lab[train]'`.
     """
@@ -128,25 +127,25 @@ def train(
         typer.Option("--output", "-o", help="The network. [the cache, where tactomo looks]"),
     ] = None,
     checkpoint: Annotated[
-        Path | None, typer.Option(help="Network to continue from. [FOLDER/RECIPE.pt]")
+        Path | None, typer.Option(help="Network to continue from. [FOLDER/CONFIGURATION.pt]")
     ] = None,
     sensor: Description = DEFAULT_DESCRIPTION,
     as_json: JsonOutput = False,
 ) -> None:
     """Train a network on simulated scenes and export it to ONNX.
 
-    A checkpoint is kept after each epoch: Ctrl-C stops, and the same command goes on, to the same
-    network as without the stop. Some of the scenes are held out; what is shown of them is the
-    correlation (ICC) of the found map with the truth, by noise and number of contacts.
+    Each epoch ends with a checkpoint: after Ctrl-C, the same command continues to the same network.
+    Some scenes are held out; the command shows the correlation (ICC) of their maps with the truth,
+    by noise and number of contacts.
 
-    *ours* takes both channels' voltages, *ours-small* is half as wide, *ours-single* has the
-    magnitude channel alone. All these want the preset robust. *paper-single* and *paper-multimodal*
-    are the paper's, on scenes of the preset paper, whose images are computed first and kept beside
-    them. All take one to two hours on two cores; after less, a few epochs with --start and a lower
-    --rate finish one.
+    *ours* takes both channels' voltages; *ours-small* is half as wide; *ours-single* takes the
+    magnitude channel alone. These need scenes of the preset robust. *paper-single* and
+    *paper-multimodal* are the paper's networks and need scenes of the preset paper, whose images
+    are computed first and kept beside the scenes. Each takes one to two hours on two cores. A few
+    more epochs with --start and a lower --rate finish a shorter training.
 
-    A network that is written to the cache is used from then on for this sensor, instead of the one
-    that ships; delete it to go back. Needs `pip install 'tactomo-lab[train]'`.
+    tactomo then uses the network in the cache for this sensor, instead of the shipped network;
+    delete the file to return to the shipped one. Needs `pip install 'tactomo-lab[train]'`.
     """
     with needs("training", EXTRA):
         from tactomo_models import load_description
@@ -202,10 +201,10 @@ def train_tanks(
 ) -> None:
     """Simulate round tanks, and train the network that `tactomo evaluate ktc` and `measured` use.
 
-    Tanks hold one to four objects of either kind and of many outlines; the network sees them by 32
-    electrodes of which none to twelve are lost, and by 16. Scenes that are there already are not
-    simulated again. Some three minutes and a quarter of an hour on one core; what ships was made
-    so. Needs `pip install 'tactomo-lab[train]'`.
+    Tanks hold one to four objects of either kind and of many outlines; the network gets voltages of
+    32 electrodes, none to twelve of them lost, and of 16 electrodes. Existing scenes are not
+    simulated again. Simulation takes three minutes, training a quarter of an hour on one core; the
+    shipped network was made so. Needs `pip install 'tactomo-lab[train]'`.
     """
     with needs("training", EXTRA):
         from tactomo_lab.training.tank_network import train as train_network

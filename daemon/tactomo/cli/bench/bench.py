@@ -127,21 +127,20 @@ def bench(
     ] = False,
     as_json: options.JsonOutput = False,
 ) -> None:
-    """Measure latency and rate on this machine, or what a method's time buys.
+    """Measure latency and rate on this machine, or the accuracy of methods over their time.
 
-    Starts a twin and a daemon of its own on free addresses, so a running demo is not disturbed
-    (but shares the processor), presses the twin in four ways and measures each. Takes about a
-    minute.
+    Starts a twin and a daemon on free addresses, presses the twin in four ways and measures each. A
+    running demo is not disturbed, but shares the processor. Takes about a minute.
 
-    With `--chart`, every method reconstructs simulated presses of mixed kinds on skins made by
-    hand, of the reporting seeds: still ones at 40, 20 and 10 dB, each from a cold start, and
-    moving ones, under budgets of 1 to 50 ms. Takes about a quarter of an hour, the first time some
-    more to simulate them.
+    With `--chart`, every method reconstructs simulated presses of mixed kinds on hand-made skins
+    (reporting seeds): still scenes at 40, 20 and 10 dB, each from a cold start, and moving scenes,
+    under budgets of 1 to 50 ms, still ones also of 2 s. Takes about a quarter of an hour, longer
+    when the scenes must be simulated first.
 
-    With `--machine-speed`, `auto` follows one moving scene under several budgets and what they took
-    is kept in the cache, beside the sensor's models: daemons then keep to a budget of time as this
-    machine does. Takes about half a minute; leave the machine alone meanwhile. A service has a
-    cache of its own: set CACHE_DIRECTORY to it.
+    With `--machine-speed`, `auto` follows one moving scene under several budgets, and the measured
+    times are kept in the cache beside the sensor's models. Daemons that start later keep a budget
+    of time on this machine. Takes about half a minute; leave the machine alone meanwhile. A service
+    has a cache of its own: set CACHE_DIRECTORY to that cache.
     """
     if show and not machine_speed:
         raise typer.BadParameter("--show goes with --machine-speed")

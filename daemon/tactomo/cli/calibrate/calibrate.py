@@ -22,16 +22,16 @@ ROWS = 9  # of the table
 app = options.typer_app(
     name="calibrate",
     help=(
-        "Find out what pressure the magnitude channel's change means on this very sensor.\n\n"
-        "Press with a flat indenter of known size on a load cell (or a scale, or weights), from "
-        "lighter than the sensor answers to as hard as it will be pressed, and back again: ten "
-        "presses or more, each held still. A rising curve is fitted to the readings, with its "
-        "uncertainty; below its onset and beyond the last reading contacts say so instead of a "
+        "Measure this sensor's curve from changes of the magnitude channel to pressure.\n\n"
+        "Press with a flat indenter of known size on a load cell (or a scale, or weights): ten "
+        "presses or more, each held still, from below the sensor's onset to the hardest press "
+        "that you expect, and back. The command fits a rising curve with its uncertainty. Below "
+        "the onset and beyond the last reading, contacts have a range instead of a "
         "pressure.\n\n"
-        "The calibration is kept by the sensor's name and devices. The sensor's daemon uses it at "
-        "once if it runs, else from its next start. A service keeps its own: `sudo "
-        "-u tactomo STATE_DIRECTORY=/var/lib/tactomo/NAME tactomo calibrate ... --sensor NAME`, or "
-        '`calibration = "FILE"` in its configuration.'
+        "The calibration belongs to the sensor's name and devices. A running daemon of the sensor "
+        "uses the calibration at once, another daemon from its next start. A service keeps its "
+        "own: `sudo -u tactomo STATE_DIRECTORY=/var/lib/tactomo/NAME tactomo calibrate ... "
+        '--sensor NAME`, or `calibration = "FILE"` in its configuration.'
     ),
     no_args_is_help=True,
     epilog=options.examples(
@@ -72,10 +72,11 @@ def live(
     address: options.Address = None,
     keys: options.KeysFolder = None,
 ) -> None:
-    """Be guided, press by press, with the running daemon.
+    """Calibrate press by press with the running daemon, which guides you.
 
-    Says what to press, waits until the contact is still, asks for the load cell's reading, and says
-    when there are enough. Ctrl-C keeps what was taken; the same command goes on from there.
+    The command says what to press, waits until the contact is still, asks for the load cell's
+    reading, and says when there are enough readings. Ctrl-C keeps the readings; the same command
+    continues later.
     """
     from tactomo_client.control import to_status
 
@@ -127,11 +128,11 @@ def fit(
     """Fit a table of readings.
 
     The table has column names: `pressure_kpa`, or `force_n` with `area_mm2` or `diameter_mm` of the
-    indenter; and `magnitude` (|Δσ|/σ₀), with `magnitude_sigma` if that is known, or, with
-    --recording, the time: `time_s` from the recording's beginning, or `realtime_s` since 1970
-    (UTC). `direction` (up, down) may be given, else it follows from the order. A log of many lines
-    a second will do: it is cut into pieces in which the load was still. Lines that the others
-    contradict are named, and nothing is kept until they are mended (or --keep-odd is given).
+    indenter; and `magnitude` (|Δσ|/σ₀), optionally with `magnitude_sigma`. With --recording, a time
+    replaces `magnitude`: `time_s` from the recording's beginning, or `realtime_s` since 1970 (UTC).
+    `direction` (up, down) is optional; by default, the order gives the direction. A log of many
+    lines a second is cut into pieces of constant load. The command names lines that contradict the
+    others, and keeps nothing until you correct them or pass --keep-odd.
     """
     if not math.isfinite(time_offset):
         raise typer.BadParameter(f"--time-offset {time_offset}: give seconds")
@@ -173,7 +174,7 @@ def show(
     sensor: options.Sensor = None,
     picture: Picture = None,
 ) -> None:
-    """Show the calibration that is kept: its curve, its uncertainty, and what it rests on."""
+    """Show a sensor's calibration: curve, uncertainty and readings."""
     from tactomo_models import CalibrationError
     from tactomo_models.calibration.calibration_file import read_calibration
 
@@ -195,7 +196,7 @@ def reload(
     address: options.Address = None,
     keys: options.KeysFolder = None,
 ) -> None:
-    """Have the running daemon read again the calibration that it finds."""
+    """Make the running daemon read its calibration file again."""
     from tactomo.cli.calibrate.reload import reload_kept
 
     say(reload_kept(sensor, address, keys))

@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 app = options.typer_app(
     name="teach",
     help=(
-        "Learn from presses at known places what the physics gets wrong on this very skin.\n\n"
+        "Correct this skin's localisation by presses at known places.\n\n"
         "With a robot, a plotter or a template, press 20 to 800 known places, spread over the "
-        "skin, one at a time. Each quarter is judged by what the others teach, and that is kept "
-        "only where it locates better than the physics alone; likewise forces, where known. From "
-        "then on each single contact says whether what was taught places it; a press unlike all "
-        "that were taught is flagged `untaught`.\n\n"
-        "It is kept by the sensor's name and devices, and used at once by the sensor's daemon if "
-        "that runs, else from its next start. A service keeps its own, see "
+        "skin, one at a time. A cross-validation on quarters of the presses compares the learnt "
+        "model with the physics, and the better one is kept; likewise for forces, where known. "
+        "A single contact is then `taught`: the model gives its place. A press unlike all taught "
+        "presses has the flag `untaught`.\n\n"
+        "The model belongs to the sensor's name and devices. A running daemon of the sensor uses "
+        "the model at once, another daemon from its next start. A service keeps its own: see "
         "`tactomo calibrate --help`."
     ),
     no_args_is_help=True,
@@ -63,10 +63,10 @@ def live(
     address: options.Address = None,
     keys: options.KeysFolder = None,
 ) -> None:
-    """Be guided, press by press, with the running daemon.
+    """Teach press by press with the running daemon, which guides you.
 
-    Says where to press, listens for a second while it is held, and learns at the end. Each
-    press is kept at once; the same command goes on from there.
+    The command says where to press, listens for a second while you hold the press, and learns at
+    the end. Each press is stored at once; the same command continues later.
     """
     from tactomo.cli.calibrate.teach_live import guided
 
@@ -98,12 +98,12 @@ def fit(
 ) -> None:
     """Learn from a file of presses.
 
-    FILE holds what `tactomo reconstruct` reads, a row for each press in order of time: `magnitude`
-    and `structure` (P, M) volts, and `magnitude_reference`, `structure_reference` (M,) of the
-    unpressed skin; and `xy_mm` (P, 2), where each press was: x to the right and y up from the
-    middle of the skin, seen from the pressed side. `force_n` (P,), if it is there, is how hard each
-    press was, newtons; NaN where that is not known. Presses that the others contradict are named,
-    and nothing is kept until they are mended (or --keep-odd is given).
+    FILE holds the arrays of `tactomo reconstruct`, a row for each press in order of time:
+    `magnitude` and `structure` (P, M) in volts, and `magnitude_reference`, `structure_reference`
+    (M,) of the unpressed skin. `xy_mm` (P, 2) holds the place of each press: x to the right and y
+    up from the middle of the skin, seen from the pressed side. `force_n` (P,) is optional: the
+    force of each press in newtons, NaN where unknown. The command names presses that contradict the
+    others, and keeps nothing until you correct them or pass --keep-odd.
     """
     from tactomo_models import load_description
     from tactomo_models.calibration.calibration_file import Subject
@@ -122,7 +122,7 @@ def show(
     ] = None,
     sensor: options.Sensor = None,
 ) -> None:
-    """Show what is kept: what it rests on, and what it brings."""
+    """Show a skin's taught model: its presses and its errors."""
     from tactomo_models import CalibrationError
     from tactomo_models.calibration.taught_skin import read_taught
 

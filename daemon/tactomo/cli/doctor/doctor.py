@@ -65,7 +65,7 @@ def doctor(
         typer.Option(
             "--description",
             "-d",
-            help="What the sensor is made of: a shipped name or a TOML file. [the daemon's, the "
+            help="Sensor description: a shipped name or a TOML file. [the daemon's, the "
             "recording's; of other files the pattern alone]",
         ),
     ] = None,
@@ -86,19 +86,19 @@ def doctor(
     """Examine a skin at rest: noise, reciprocity, electrodes, clipping, drift, line and latency.
 
     **Nothing may touch the skin meanwhile.** Exit status 0: healthy (maybe with advice). 1: ill
-    (something is to be mended), broken (nothing can be trusted), or unknown.
+    (something needs repair), broken (no reading can be trusted), or unknown.
 
-    *SNR* is the voltages over their standard deviation: 60 dB is good, below 36 dB is ill, below
-    20 dB broken. *Reciprocity*: V(drive; measure) = V(measure; drive) on any sheet, so a
-    difference is the device's; up to 5 % of all voltages together is usual, above 20 % nothing can
-    be located. Electrodes are counted from 0: *dead* (reads nothing), *loose* (noisier than the
-    others, or jumps), *misread* (breaks laws that any sheet obeys: a break, a short), *swapped*
-    (two leads changed places; needs a description).
+    *SNR* is the ratio of the voltages to their standard deviation: 60 dB is good, below 36 dB is
+    ill, below 20 dB broken. *Reciprocity*: on any sheet, V(drive; measure) = V(measure; drive), so
+    the device causes any difference. A difference of up to 5 % over all voltages is usual; above 20
+    %, nothing can be located. Electrodes count from 0: *dead* (reads nothing), *loose* (noisier
+    than the others, or jumps), *misread* (breaks a law of any sheet: an open or shorted lead),
+    *swapped* (two leads changed places; needs a description).
 
-    A file is read as `tactomo reconstruct` reads it; `--array` names scans at rest, (T, voltages),
-    or one called reference, baseline, rest, empty or vh is taken. Without a description the order
-    is `--pattern`, or the one that fits: by where the zeros are, of every drive by every measuring
-    pair; else by reciprocity. How the file was read is part of the report.
+    `tactomo doctor` reads files as `tactomo reconstruct` does. `--array` names scans at rest, (T,
+    voltages); without it, an array called reference, baseline, rest, empty or vh is taken. Without
+    a description, `--pattern` gives the order of the voltages, or the command takes the pattern
+    that fits the zeros or the reciprocity. The report says how the file was read.
     """
     from tactomo_client.keys import as_keys
     from tactomo_models.health.findings import worst

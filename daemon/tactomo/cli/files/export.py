@@ -92,28 +92,28 @@ def export(
     pose: Pose = "0,0,0",
     force: Force = False,
 ) -> None:
-    """Write the frames of a recording for other programs; the extension of OUT says for which.
+    """Write the frames of a recording in a format of other programs, by the extension of OUT.
 
     *.mcap* opens in Foxglove: 3D, Image and Plot panels show what `tactomo foxglove` shows live.
     Needs foxglove-sdk: `pip install 'tactomo[foxglove]'`.
 
-    *--ros2* writes a folder that `ros2 bag play` plays: maps and contacts as PointCloud2,
-    WrenchStamped and PoseWithCovarianceStamped, and diagnostics. Needs rosbags, and no ROS:
-    `pip install 'tactomo[ros2]'`.
+    *--ros2* writes a folder for `ros2 bag play`: maps and contacts as PointCloud2, WrenchStamped
+    and PoseWithCovarianceStamped, and diagnostics. Needs rosbags, and no ROS: `pip install
+    'tactomo[ros2]'`.
 
-    *--lerobot* writes a folder that LeRobot trains on: maps and contacts as the numbers that they
-    are, with masks for what is not known. Needs lerobot, and Python 3.12.
+    *--lerobot* writes a LeRobot dataset: maps and contacts as exact numbers, with masks for unknown
+    values. Needs lerobot, and Python 3.12.
 
-    *.csv* has a row for each contact in each frame, and one with an empty `id` for a frame in which
-    nothing is pressed. Units are in the names; what is unknown is empty. Numbers are exact.
+    *.csv* has a row for each contact in each frame; a frame without contacts has a row with an
+    empty `id`. Names hold the units; unknown values are empty. Numbers are exact.
 
     *.npz* has `time_s`, `acquired_realtime_ns`, `scan_counter`, `age_s` (T,), `x_mm` (nx,), `y_mm`
-    (ny,), `pressure_kpa` (T, ny, nx), and all that `tactomo reconstruct` writes but `seconds`.
+    (ny,), `pressure_kpa` (T, ny, nx), and all arrays of `tactomo reconstruct` except `seconds`.
 
-    Frames are the recorded ones (`tactomo record --maps`). Without any, or with `--description`,
-    the recording is reconstructed first, by the same code as live. Times are in seconds from the
-    recording's beginning. The size of a recording does not matter: memory stays small. What a
-    recording lacks (lost frames, a clock that was set, restarts) is counted on standard error.
+    The frames are the recorded frames (`tactomo record --maps`). Where there are none, or with
+    `--description`, the command first reconstructs the recording, by the same code as live. Times
+    are seconds from the recording's beginning. Memory stays small for a recording of any size. Lost
+    frames, clock steps and restarts are counted on standard error.
     """
     kind = BAG if ros2 else DATASET if lerobot else _kind(output)
     is_folder = ros2 or lerobot

@@ -41,11 +41,11 @@ def import_scans(
     """Turn measured scans (.npz, .eit) into a recording that replays through the daemon.
 
     Reads the layouts of `tactomo reconstruct` (magnitude, structure and their references; frames of
-    one channel in a .mat or text), and single-ended readings as EIT instruments save them:
-    `volts` (T, injections, electrodes) with `injection` (injections, 2) and `t`. Those become
-    differences of neighbouring electrodes in the description's order; of complex volts the part in
-    phase with the current counts. So do the .eit files that Sciospec's
-    own program saves, one a frame, in the order of their dates.
+    one channel in a .mat or text), single-ended readings of EIT instruments, and Sciospec's .eit
+    files. Single-ended readings are `volts` (T, injections, electrodes) with `injection`
+    (injections, 2) and `t`. Their differences of neighbouring electrodes become the voltages, in
+    the description's order; of complex volts, the part in phase with the current counts. Sciospec's
+    program saves one .eit file per frame; the files are read in the order of their dates.
     """
     from rich.progress import track
     from tactomo_models import load_description

@@ -69,54 +69,47 @@ def reconstruct(
 ) -> None:
     """Reconstruct a file of scans, without a daemon.
 
-    OUT may be an earlier one of this command; anything else is written over with `--force` only.
+    OUT may be an earlier result of this command; other files are overwritten only with `--force`.
 
-    IN holds `magnitude` and `structure` (T, M) volts and `magnitude_reference`,
-    `structure_reference` (M,), or (n, M) scans at rest; structure may be missing. Or it is what
-    `tactomo import` reads, or frames of one channel, one a row or a column: an array of a .mat (up
-    to version 7), or numbers in text (.csv, .txt). Then the reference is an array called reference,
-    baseline, rest, empty or vh, `--reference-frames` of IN, or the mean of the file `--reference`.
-    `--pattern 32:adjacent`, `16:opposite:adjacent` or
-    `16:adjacent:rotated` says which electrodes the numbers are of, where the description says
-    otherwise; it gets as many electrodes.
+    IN holds `magnitude` and `structure` (T, M) in volts, and `magnitude_reference`,
+    `structure_reference` (M,), or (n, M) scans at rest; structure may be missing. IN may also be a
+    file that `tactomo import` reads, or hold frames of one channel, a frame per row or column: an
+    array of a .mat (up to version 7), or numbers in text (.csv, .txt). The reference is then an
+    array called reference, baseline, rest, empty or vh, `--reference-frames` of IN, or the mean of
+    the file `--reference`. `--pattern 32:adjacent`, `16:opposite:adjacent` or `16:adjacent:rotated`
+    replaces the description's electrodes and pattern.
 
-    OUT gets `map` (T, ny, nx), the relative conductivity change; `pressure_kpa` (T, ny, nx), NaN
-    where unknown; `structure` (T, ny, nx) from 0 to 1; `misfit`, `confidence` (the correlation with
-    the truth that the network expects, where a network made the map), `force_n` (of all contacts
-    together), `force_sigma_n`, `flags` and `seconds` (T,); and the contacts as flat arrays
+    OUT holds, for T frames: `map` (T, ny, nx), the relative conductivity change; `pressure_kpa` (T,
+    ny, nx), NaN where unknown; `structure` (T, ny, nx), 0 bare to 1 pressed (-1 for objects that
+    conduct worse, where objects conduct `either_way`); `misfit`, `confidence`, `force_n`,
+    `force_sigma_n`, `flags` and `seconds` (T,). The contacts of all frames are flat arrays:
     `contact_frame`, `contact_x_mm`, `contact_y_mm`, `contact_area_mm2`, `contact_magnitude`,
-    `contact_sigma` (of the magnitude), and the standard uncertainties `contact_x_sigma_mm`,
-    `contact_y_sigma_mm`, `contact_area_sigma_mm2`; and how hard is pressed, `contact_pressure_kpa`,
-    `contact_force_n`, their uncertainties `contact_pressure_sigma_kpa`, `contact_force_sigma_n`,
-    and `contact_pressure_range` (*within*, *below*, *above* or *unknown*); the highest pressure
-    under each, `contact_peak_kpa`, `contact_peak_sigma_kpa`, what it cannot exceed,
-    `contact_max_kpa` (95 %), and how the pressure falls to the edge, `contact_edge` (0 flat, 0.5
-    Hertz), and `contact_taught`, whether --taught says where it is. Where the sensor's objects
-    conduct `either_way`, such as metal and plastic in a tank, `structure` is -1 in those that
-    conduct worse.
+    `contact_pressure_kpa`, `contact_force_n`, their standard uncertainties (`contact_sigma` is the
+    magnitude's), `contact_pressure_range` (*within*, *below*, *above* or *unknown*), the highest
+    pressure `contact_peak_kpa` with its upper bound `contact_max_kpa` (95 %), the profile exponent
+    `contact_edge` (0 flat, 0.5 Hertz), and `contact_taught`. docs/files.md explains each array.
 
-    Frames follow one another, as in a stream: each one starts from what the last one found. Give
-    scenes that have nothing to do with each other in files of their own.
+    Frames form a sequence, as in a stream: each solve starts from the result of the frame before.
+    Put unrelated scenes into files of their own.
 
-    `misfit` is what the model left unexplained, in units of the scans' noise: about 1 is good, and
-    above 2 (1.5 over both channels, where an unsure network stands in) the frame is flagged.
+    `misfit` is the rms of the residual in units of the scans' noise: about 1 is good, and a frame
+    above 2 is flagged (above 1.5 over both channels, where a network with low confidence made the
+    map).
 
-    `flags` adds up what stands in the way of trusting a frame: 1 structure missing, 2 magnitude
-    missing, 4 invalid voltage, 8 no reference, 16 misfit high, 32 not converged, 64 reference
-    mismatch, 128 electrode fault, 256 noise high, 512 channels swapped, 1024 saturated,
-    2048 low confidence, 4096 channels skewed and 16384 reference disputed (live only), 8192 no
-    usable scan, 32768 untaught, 65536 creeping (live only),
-    131072 companion missing, 262144 companion disputed.
+    `flags` is the sum of the reasons to distrust a frame: 1 structure missing, 2 magnitude missing,
+    4 invalid voltage, 8 no reference, 16 misfit high, 32 not converged, 64 reference mismatch, 128
+    electrode fault, 256 noise high, 512 channels swapped, 1024 saturated, 2048 low confidence, 4096
+    channels skewed and 16384 reference disputed (live only), 8192 no usable scan, 32768 untaught,
+    65536 creeping (live only), 131072 companion missing, 262144 companion disputed.
 
-    Methods: *tikhonov* and *noser* are one linear step, regularised so that the image is as noisy,
-    relative to its signal, as the scans are (noise figure 1); *fit* models a few contacts,
-    *levelset* shapes of any form, both nonlinear and down to the scans' noise; *network* is our
-    fusion network alone. *auto* is *fit*, and where the sensor has a network, the network proposes
-    what the fit starts from, and stands in where the fit does not explain the scans. Where objects
-    conduct `either_way`, *fit* and *auto* are *noser*. The laboratory adds
-    *pls-paper*, the level set of the paper that tactomo is compared with, and the paper's networks,
-    *cnn-single* and *cnn-multimodal*. Of several, OUT holds the first one's maps; the others' are
-    drawn beside them in the picture.
+    Methods: *tikhonov* and *noser* take one linear step, regularised so that the image has the same
+    noise relative to its signal as the scans (noise figure 1). *fit* fits contacts, *levelset*
+    shapes of any form; both are nonlinear and fit to the scans' noise. *network* is a network
+    alone. *auto* is *fit*; where the sensor has a network, the network proposes the start of the
+    fit, and makes the map where no fit explains the scans. Where objects conduct `either_way`,
+    *fit* and *auto* are *noser*. The laboratory adds *pls-paper*, the level set of the paper that
+    tactomo is compared with, and the paper's networks, *cnn-single* and *cnn-multimodal*. Of
+    several methods, OUT holds the maps of the first; the picture shows all.
     """
     from tactomo_models import load_description
     from tactomo_models.batch import reconstruct_file, reference_at_rest

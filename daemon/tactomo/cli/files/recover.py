@@ -27,11 +27,11 @@ def recover(
         typer.Option("--output", "-o", help="The new file. [FILE-recovered.mcap beside it]"),
     ] = None,
 ) -> None:
-    """Rewrite a cut or damaged recording whole and indexed, so that any MCAP tool opens it.
+    """Rewrite a cut or damaged recording with an index, so that any MCAP tool opens it.
 
-    Keeps everything that a checksum confirms, also beyond damage in the middle, and says what is
-    lost. The damaged file stays as it is. A replay of the new file gives the maps of the live run;
-    after a gap it starts cold, and it shows no maps where their reference is lost.
+    Keeps every part that a checksum confirms, also beyond damage in the middle, and lists the
+    losses. The damaged file stays unchanged. A replay of the new file gives the maps of the live
+    run. After a gap, the replay starts cold; where the reference is lost, there are no maps.
     """
     from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn
 

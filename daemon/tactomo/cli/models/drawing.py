@@ -46,13 +46,13 @@ def draw(
 ) -> None:
     """Draw a sensor description, true to scale, and where the sensor sees well.
 
-    The sheet as seen from the pressed side: its frame, which cannot be pressed, electrodes with
-    their numbers, the first drive pair and what is measured meanwhile, and the nodes of the map.
-    Print it at 100 % and lay it on the sheet: what is numbered the other way round is seen at once.
+    The drawing shows the sheet from the pressed side: the frame, which cannot be pressed, the
+    electrodes with their numbers, the first drive pair with its measuring pairs, and the nodes of
+    the map. Print it at 100 % and lay it on the sheet: a wrong numbering shows at once.
 
-    Beside it, to first order and with the noise of a usual converter, how clearly a light press is
-    seen and how well it is located, by where it is. Builds the sensor's models where they are
-    missing. Needs matplotlib: `pip install 'tactomo[plot]'`.
+    Two maps beside the drawing show how clearly a light press is detected and how well it is
+    located, by its place: to first order, with the noise of a usual converter. The command builds
+    the sensor's models where they are missing. Needs matplotlib: `pip install 'tactomo[plot]'`.
     """
     from tactomo_models import load_description
     from tactomo_models.physics.artifact import load_or_build_artifact

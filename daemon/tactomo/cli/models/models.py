@@ -34,9 +34,9 @@ def build(
 ) -> None:
     """Build the models of a sensor description: forward model, Jacobian, Tikhonov matrix.
 
-    The daemon does this by itself when they are missing; building ahead spares its first start.
-    They are bound to the description by a hash: after a change of geometry, build again. A file
-    that is there is not written over, unless it holds these models already.
+    The daemon builds missing models at its start; this command saves the daemon the time. A hash
+    binds the models to the description: after a change of geometry, build again. A file is
+    overwritten only if it already holds these models.
     """
     from tactomo_models import ArtifactError, load_description
     from tactomo_models.physics.artifact import (

@@ -49,14 +49,15 @@ def plot(
 ) -> None:
     """Draw a recording on one page.
 
-    *maps*: at telling moments, lettered; each stretch with the same contacts is shown, the longest
-    ones first. *path*: where the contacts went. *pressure*, *force*: over time, with a band of two
-    standard uncertainties (95 %) where they are known. *misfit*: what the model left unexplained;
-    about 1 is good. *flags*: the method of each frame, and what to be wary of. *timing*: how old
-    frames were when they were published, the time between them, and which were lost.
+    *maps*: a map for each stretch with the same contacts, the longest stretches first, marked by
+    letters. *path*: the contacts' paths. *pressure*, *force*: over time, with a band of two
+    standard uncertainties (95 %) where known. *misfit*: the rms of the residual in units of the
+    noise; about 1 is good. *flags*: the method and the flags of each frame. *timing*: the age of
+    frames at publication, the time between frames, and lost frames.
 
-    Uses the recorded maps (`tactomo record --maps`); without any the recording is reconstructed
-    first, by the same code as live. Needs matplotlib: `pip install 'tactomo[plot]'`.
+    Uses the recorded maps (`tactomo record --maps`). Without recorded maps, the command first
+    reconstructs the recording, by the same code as live. Needs matplotlib: `pip install
+    'tactomo[plot]'`.
     """
     panels = _panels(what)
     prepare_picture(output, force=force)

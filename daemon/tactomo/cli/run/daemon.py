@@ -48,10 +48,10 @@ def daemon(
         float | None, typer.Option(help="Time per frame. [the method's own]")
     ] = None,
     stream: Annotated[
-        str | None, typer.Option(help=f"Where to publish. [{options.DEFAULT_STREAM}]")
+        str | None, typer.Option(help=f"Address of the stream. [{options.DEFAULT_STREAM}]")
     ] = None,
     control: Annotated[
-        str | None, typer.Option(help=f"Where to take commands. [{options.DEFAULT_CONTROL}]")
+        str | None, typer.Option(help=f"Address for commands. [{options.DEFAULT_CONTROL}]")
     ] = None,
     set_: Annotated[
         list[str] | None,
@@ -64,13 +64,13 @@ def daemon(
 ) -> None:
     """Read a skin's ports, reconstruct, and publish maps and contacts until stopped.
 
-    A configuration may describe several skins, each in a table [skins.NAME]: each gets a process,
-    and one that ends is started again. --sensor runs that one alone.
+    A configuration may describe several skins, each in a table [skins.NAME]. Each skin gets a
+    process, and a process that ends is started again. --sensor starts this skin alone.
 
-    At the start the skin must be free for a second: the first scans become the reference that
-    changes are measured against. `tactomo tare` takes a new one at any time.
+    At the start, nothing may touch the skin for a second: changes are measured against these first
+    scans, the reference. `tactomo tare` takes a new reference at any time.
 
-    `tactomo service example` shows every key of the configuration. `--set` takes each of them:
+    `tactomo service example` shows every key of the configuration. `--set` takes any key:
     `lossless=true`, `tare_scans=40`, `metrics=127.0.0.1:9460`, `recording.file=grasp.mcap`.
     """
     from tactomo.config import DaemonConfig, load_skins
@@ -152,15 +152,14 @@ def replay(
 ) -> None:
     """Play a recording through the daemon, which cannot tell it from a device.
 
-    The bytes are read from the recording and take the same way as live ones: the maps equal
-    those of the live run. Without --viewer and --stay it ends with the recording.
+    The recorded bytes take the way of live bytes, so the maps equal those of the live run. Without
+    --viewer and --stay, the replay ends with the recording.
 
-    A folder of files that a daemon has cut is played as the one recording that it was, from the
-    oldest to the newest; pauses between them are shortened to a second.
+    A folder of files that a daemon has cut is played as one recording, from the oldest to the
+    newest; pauses between files are shortened to a second.
 
-    With --viewer it shows its first frame and waits until somebody looks at the page. There, or by
-    the command `replay` of the control socket, it is paused, stepped, moved and paced while it
-    runs.
+    With --viewer, the replay shows its first frame and waits until a browser opens the page. The
+    page, or the command `replay` of the control socket, pauses, steps, moves and slows the replay.
     """
     from tactomo.cli.run.demo import free_of, show_replay
     from tactomo.recordings.recording_set import RecordingSet, open_replayable

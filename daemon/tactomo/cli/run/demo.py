@@ -60,8 +60,7 @@ def demo(
         str | None,
         typer.Option(
             "--twin-control",
-            help=f"Where to take commands of `tactomo poke`. [{options.DEFAULT_TWIN_CONTROL}, or "
-            "the next that is free]",
+            help=f"Address for `tactomo poke`. [{options.DEFAULT_TWIN_CONTROL}, or the next free]",
         ),
     ] = None,
     no_browser: Annotated[
@@ -74,9 +73,10 @@ def demo(
 ) -> None:
     """Start a skin to press in the browser: simulated sensor, daemon and viewer in one command.
 
-    The first start builds the sensor's models, which takes a moment. Ctrl-C stops everything.
-    With tcp addresses of port 0 it takes free ports and prints them. What `tactomo record` records
-    of it goes into this folder. The page presses the skin by itself until somebody does.
+    The first start builds the sensor's models, which takes a few seconds. Ctrl-C stops everything.
+    For tcp addresses with port 0, the demo takes free ports and prints them. `tactomo record`
+    writes recordings into this folder. The page presses the skin by itself until somebody presses
+    it.
     """
     from tactomo.cli.children import new_family
 

@@ -61,12 +61,12 @@ def foxglove(
     """Serve maps, contacts, numbers and events to Foxglove until stopped.
 
     In Foxglove (the desktop app, or a browser on this computer): *Open connection*, *Foxglove
-    WebSocket*, ws://127.0.0.1:8765; then *Import from file* under *Layouts*, with the file that
-    `--layout` writes. It only shows: nothing that is done there reaches the sensor.
-    No web page but Foxglove's may look, unless its origin is allowed.
+    WebSocket*, ws://127.0.0.1:8765; then *Import from file* under *Layouts*, with the file of
+    `--layout`. Foxglove only shows the sensor and sends no commands. Only Foxglove's own web page
+    may connect, and the origins of `--allow-origin`.
 
-    Needs foxglove-sdk: `pip install 'tactomo[foxglove]'`. Recordings open there, too, after
-    `tactomo export RECORDING OUT.mcap`.
+    Needs foxglove-sdk: `pip install 'tactomo[foxglove]'`. `tactomo export RECORDING OUT.mcap`
+    converts a recording for Foxglove.
     """
     with needs("Foxglove", "pip install 'tactomo[foxglove]'"):
         import foxglove as _  # noqa: F401

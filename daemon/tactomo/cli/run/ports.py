@@ -55,10 +55,10 @@ def ports(
     ] = None,
     as_json: JsonOutput = False,
 ) -> None:
-    """List serial adapters: lasting names for the configuration, who holds them, what is amiss.
+    """List serial adapters with their permanent names, the processes that use them, and problems.
 
-    Give the daemon the lasting name: /dev/ttyACM0 may be another device after the next start.
-    Names *by-id* follow the device into any socket; names *by-path* belong to the socket.
+    Give the daemon the permanent name: /dev/ttyACM0 may be another device after the next start. A
+    name *by-id* belongs to the device, in any socket; a name *by-path* belongs to the socket.
     """
     found = survey(paths or [])
     asked = [row.path for row in found if paths or (row.adapter and row.adapter.is_usb)]

@@ -46,15 +46,15 @@ def twin(
     ] = 0.03,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal noise and drift.")] = 0,
     twin_control: Annotated[
-        str, typer.Option("--twin-control", help="Where to take commands of `tactomo poke`.")
+        str, typer.Option("--twin-control", help="Address for `tactomo poke`.")
     ] = options.DEFAULT_TWIN_CONTROL,
     announce: options.Announce = False,
 ) -> None:
     """Simulate a skin behind simulated firmware, on real pseudo-terminals, until stopped.
 
-    It speaks the same wire protocol as a real device, so a daemon (or your own program) opens its
-    ports as it would open /dev/ttyACM0. `tactomo poke` presses and disturbs it while it runs:
-    press, release, mute a channel, send garbage, unplug and replug.
+    The twin speaks the wire protocol of a real device, so a daemon (or your own program) opens the
+    twin's ports like /dev/ttyACM0. `tactomo poke` presses and disturbs a running twin: press,
+    release, mute a channel, send garbage, unplug and replug.
     """
     from tactomo_models import load_description
 

@@ -57,9 +57,9 @@ def zenoh(
 ) -> None:
     """Carry streams beyond this computer by Eclipse Zenoh, until stopped.
 
-    On a robot, `--from` publishes the streams of its daemons; elsewhere, `--bind` gives them one
-    address, where every client of ZeroMQ finds them. The daemons' control sockets stay where they
-    are. A skin on which nothing changes is sent by a heartbeat of 0.3 s alone.
+    On a robot, `--from` publishes the streams of the daemons. Elsewhere, `--bind` serves these
+    streams to ZeroMQ clients at one address. The daemons' control sockets are not carried. A skin
+    on which nothing changes sends only a heartbeat every 0.3 s.
 
     Needs eclipse-zenoh: `pip install 'tactomo[zenoh]'`.
     """

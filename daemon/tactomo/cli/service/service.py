@@ -53,10 +53,10 @@ def install(
 ) -> None:
     """Install, enable and start the service of one skin: `tactomo@NAME`.
 
-    An adapter that is plugged in gets a name that lasts, /dev/tactomo/NAME, by a udev rule. The
-    configuration, /etc/tactomo/NAME.toml, is yours from then on: installing again leaves it alone.
-    Several skins on one computer are installed one by one, each with addresses of its own, or share
-    a configuration that you write, deploy/examples/robot.toml.
+    A udev rule gives a connected adapter the permanent name /dev/tactomo/NAME. The configuration,
+    /etc/tactomo/NAME.toml, is yours: a second installation does not change it. Install several
+    skins one by one, each with addresses of its own, or write one configuration for all skins
+    (deploy/examples/robot.toml).
     """
     from tactomo.acquisition import udev
     from tactomo.acquisition.adapters import list_adapters

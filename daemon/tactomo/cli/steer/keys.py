@@ -57,7 +57,7 @@ def make(
     folder: Folder = None,
     force: Force = False,
 ) -> None:
-    """Make a pair of keys and say what to do with it."""
+    """Make a pair of keys, and print the next steps."""
     from tactomo.stream.keys import (
         clients_folder,
         how_to_allow,
@@ -104,9 +104,9 @@ def allow(
     folder: Folder = None,
     force: Force = False,
 ) -> None:
-    """Let a client in, or change what it may do: read the stream, or also command.
+    """Allow a client to read the stream, or also to send commands.
 
-    A running daemon takes it up at once.
+    A running daemon applies the change at once.
     """
     from tactomo.stream.keys import allow as put_on_list
 
@@ -121,9 +121,9 @@ def revoke(
     server: ForServer,
     folder: Folder = None,
 ) -> None:
-    """Take a client off the list; a running daemon cuts it off within two seconds.
+    """Remove a client from the list; a running daemon disconnects the client within two seconds.
 
-    All of the daemon's other clients connect anew in that moment, by themselves.
+    All other clients of the daemon reconnect by themselves at that moment.
     """
     from tactomo.stream.keys import revoke as take_off_list
 
@@ -134,7 +134,7 @@ def revoke(
 
 @app.command("list", epilog=examples("tactomo keys list"))
 def list_(folder: Folder = None) -> None:
-    """Show the keys made here, and for each server who may come in."""
+    """List the keys made here, and for each server the allowed clients."""
     from tactomo_client.keys import read_public
 
     from tactomo.stream.keys import list_clients, list_pairs, list_servers, public_path

@@ -28,10 +28,10 @@ def status(
     keys: options.KeysFolder = None,
     as_json: options.JsonOutput = False,
 ) -> None:
-    """Show how the daemon is: first what is wrong and what to do about it, then all there is.
+    """Show the daemon's state: problems with their next steps first, then all values.
 
-    Ports, rates, latency, the time of each stage, what was lost, what happened since the start.
-    `tactomo doctor` looks deeper.
+    Values: ports, rates, latency, time of each stage, losses, and events since the start. `tactomo
+    doctor` examines the skin itself.
     """
     answer = newest_status(sensor, address, keys)
     if as_json:

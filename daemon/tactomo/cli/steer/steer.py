@@ -86,14 +86,12 @@ def record(
     address: options.Address = None,
     keys: options.KeysFolder = None,
 ) -> None:
-    """Record what the ports say (every byte, with its time) into an MCAP file.
+    """Record every byte of the ports, with its time, into an MCAP file.
 
-    The daemon writes the file, so it keeps recording when this command ends: on its computer, into
-    the folder that its configuration names (`recording.folder`; without that
-    ~/.local/share/tactomo/recordings, of `tactomo demo` the one it was started in), and nowhere
-    else. `start` without FILE cuts the recording into files of which the newest are kept, as the
-    configuration says under [recording]. `tactomo replay` plays a file again; each of several
-    replays by itself.
+    The daemon writes the file on its own computer, into its `recording.folder` alone (by default
+    ~/.local/share/tactomo/recordings; for `tactomo demo`, the folder of its start), and continues
+    when this command ends. `start` without FILE cuts the recording into files and keeps the newest,
+    as configured under [recording]. `tactomo replay` plays a file.
     """
     from tactomo_client import Daemon
 
@@ -132,8 +130,8 @@ def method(
 ) -> None:
     """Choose the reconstruction method while the daemon runs.
 
-    One of your own (my_module:MyMethod) can be chosen where the daemon was started with it, or its
-    distribution is installed beside the daemon.
+    A running daemon offers your own method (my_module:MyMethod) only if the daemon was started with
+    that method, or if the method's distribution is installed beside the daemon.
     """
     from tactomo_client import Daemon
 
@@ -169,10 +167,10 @@ def poke(
 ) -> None:
     """Press, move, release and break a running twin, as a test of your own robot would.
 
-    `press` (x_mm, y_mm, id, radius_mm, pressure_kpa, shape; the same id again moves it),
-    `release` (id), `clear`, `scene` (what presses now), `play` (the scripted scene from its start),
-    `noise` (noise_v), `drift` (swing_k, period_s, step_k, press_creep, ...), `mute` (channel,
-    seconds), `garbage` (count, port), `unplug` and `replug` (port), `status`.
+    Commands: `press` (x_mm, y_mm, id, radius_mm, pressure_kpa, shape; the same id again moves the
+    press), `release` (id), `clear`, `scene` (list the present presses), `play` (restart the
+    scripted scene), `noise` (noise_v), `drift` (swing_k, period_s, step_k, press_creep, ...),
+    `mute` (channel, seconds), `garbage` (count, port), `unplug` and `replug` (port), `status`.
     """
     from tactomo_client import request
 

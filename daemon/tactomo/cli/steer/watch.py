@@ -39,8 +39,8 @@ def watch(
 ) -> None:
     """Show the pressure map, the contacts and the daemon's health live in the terminal.
 
-    Without a terminal (in a pipe) it prints one line a frame instead. Ctrl-C ends it. Where no such
-    sensor runs at the start, it ends with exit status 1.
+    In a pipe, the command prints one line per frame instead. Ctrl-C ends the command. If no such
+    sensor runs at the start, the exit status is 1.
     """
     from tactomo.cli.console import Console
 
