@@ -35,9 +35,10 @@ PRESS = {"pressure_kpa": 200.0, "radius_mm": 10.0}
 NEAR_MM = 3.0
 
 
-@pytest.fixture(
-    scope="module", params=[GRADED, POLYGON, pytest.param(SATURATING, marks=pytest.mark.slow)]
-)
+SLOW = [pytest.param(sensor, marks=pytest.mark.slow) for sensor in (POLYGON, SATURATING)]
+
+
+@pytest.fixture(scope="module", params=[GRADED, *SLOW])
 def one_sheet(request: pytest.FixtureRequest) -> Iterator[tuple[Demo, str]]:
     """A demo, pressed at AT_MM, and its channel."""
     with running_demo("--description", request.param) as demo:

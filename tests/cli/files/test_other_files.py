@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ FRAMES = 4
 ROWS = np.arange(416.0).reshape(2, 208) + 1
 
 
+@cache
 def tank(pattern: str = "16:adjacent") -> tuple[FloatArray, FloatArray]:
     """Scans of an empty tank (FRAMES, M), and with an object at (50, 20) mm, with some noise."""
     named = NamedPattern.of_name(pattern)

@@ -28,6 +28,8 @@ from tactomo_models.calibration.calibration_file import (
 from tactomo_models.calibration.curve import Reading
 from tactomo_models.calibration.taught_skin import TaughtSkin, save_taught, taught_path
 
+Start = Callable[..., Any]
+
 SENSOR = load_description("paper_square")
 SUBJECT = Subject(sensor="left", description=SENSOR.name, sha256=SENSOR.sha256)
 RELOADED = "calibration_reloaded"
@@ -52,7 +54,7 @@ def kept(path: Path | None = None, factor: float = 1.0, **changes: Any) -> Press
     return made
 
 
-def test_it_is_found_by_the_sensors_name_and_told_in_the_status(bench: Callable[..., Any]) -> None:
+def test_it_is_found_by_the_sensors_name_and_told_in_the_status(bench: Start) -> None:
     made = kept()
     description = bench().ask("status")["description"]
     told = description["calibration"]
@@ -66,15 +68,7 @@ def test_it_is_found_by_the_sensors_name_and_told_in_the_status(bench: Callable[
     )
 
 
-def test_without_one_pressures_are_the_descriptions(bench: Callable[..., Any]) -> None:
-    daemon = bench()
-    description = daemon.ask("status")["description"]
-    assert description["calibration"] is None
-    assert description["pressure_max_kpa"] == 300
-    assert daemon.ask("status")["events"]["counts"].get("calibration_refused", 0) == 0
-
-
-def test_another_sensors_is_refused_by_name(bench: Callable[..., Any], tmp_path: Path) -> None:
+def test_another_sensors_is_refused_by_name(bench: Start, tmp_path: Path) -> None:
     kept(sensor="right")
     status = bench().ask("status")
     assert status["description"]["calibration"] is None
@@ -88,12 +82,12 @@ def test_another_sensors_is_refused_by_name(bench: Callable[..., Any], tmp_path:
         bench(calibration=asked_for)
 
 
-def test_one_that_is_asked_for_must_be_there(bench: Callable[..., Any], tmp_path: Path) -> None:
+def test_one_that_is_asked_for_must_be_there(bench: Start, tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"there is no calibration .*absent"):
         bench(calibration=tmp_path / "absent")
 
 
-def test_a_damaged_one_is_told_and_not_used(bench: Callable[..., Any]) -> None:
+def test_a_damaged_one_is_told_and_not_used(bench: Start) -> None:
     kept()
     path = calibration_path("left")
     path.write_text(path.read_text().replace('"format": 1', '"format": 2'))
@@ -101,7 +95,7 @@ def test_a_damaged_one_is_told_and_not_used(bench: Callable[..., Any]) -> None:
     assert "is of format 2, and this tactomo reads format 1" in trouble["detail"]
 
 
-def test_it_is_not_in_force_with_another_device(bench: Callable[..., Any]) -> None:
+def test_it_is_not_in_force_with_another_device(bench: Start) -> None:
     kept(device_ids=("skin-elsewhere",))
     daemon = bench()
     daemon.tare()
@@ -110,10 +104,19 @@ def test_it_is_not_in_force_with_another_device(bench: Callable[..., Any]) -> No
     assert daemon.ask("status")["description"]["calibration"] is None
 
 
+def test_another_device_is_judged_by_the_new_one(bench: Start) -> None:
+    daemon = bench()
+    kept(device_ids=("bench-2",))
+    daemon.ask("reload_calibration")  # nobody has said yet who it is
+    daemon.tare()
+    daemon.listener.event("calibration_refused")
+    assert daemon.ask("status")["description"]["calibration"] is None
+    kept(device_ids=("bench-1", "bench-2"))
+    assert daemon.ask("reload_calibration")["calibration"]["readings"] == len(READINGS)
+
+
 @pytest.mark.slow
-def test_a_recording_takes_it_along(
-    bench: Callable[..., Any], replay: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_a_recording_takes_it_along(bench: Start, replay: Start, tmp_path: Path) -> None:
     kept()
     daemon = bench(recording={"file": tmp_path / "press.mcap"})
     daemon.tare()
@@ -126,67 +129,58 @@ def test_a_recording_takes_it_along(
     assert again.origin == replace(recording.origin, ports=again.origin.ports)
 
 
-def test_a_new_one_is_in_force_at_once(bench: Callable[..., Any]) -> None:
+def test_a_new_one_is_in_force_at_once_and_one_that_was_deleted_no_more(bench: Start) -> None:
     daemon = bench()
     daemon.tare()
+
+    def in_force() -> tuple[Any, float]:
+        description = daemon.ask("status")["description"]
+        return description["calibration"], description["pressure_max_kpa"]
+
+    assert in_force() == (None, 300)
     for factor in (1.0, 1.1):
         made = kept(factor=factor)
-        in_force = daemon.ask("reload_calibration")["calibration"]
-        assert in_force["range_kpa"] == list(made.curve.range_kpa)
-        description = daemon.ask("status")["description"]
-        assert description["calibration"] == in_force
-        assert description["pressure_max_kpa"] == made.pressure_kpa[-1]
-        assert description["magnitude_response"]["pressure_kpa"] == list(made.pressure_kpa)
-        daemon.listener.wait(
-            "status", lambda s, now=in_force: s["description"]["calibration"] == now
-        )
+        told = daemon.ask("reload_calibration")["calibration"]
+        assert told["range_kpa"] == list(made.curve.range_kpa)
+        assert in_force() == (told, made.pressure_kpa[-1])
+        response = daemon.ask("status")["description"]["magnitude_response"]
+        assert response["pressure_kpa"] == list(made.pressure_kpa)
+        daemon.listener.wait("status", lambda s, now=told: s["description"]["calibration"] == now)
         daemon.listener.wait(
             "event", lambda e, made=made: (e["name"], e["detail"]) == (RELOADED, made.words)
         )
-
-
-def test_where_it_was_deleted_pressures_are_the_descriptions_again(
-    bench: Callable[..., Any],
-) -> None:
-    kept()
-    daemon = bench()
     calibration_path("left").unlink()
     assert daemon.ask("reload_calibration") == {"calibration": None, "taught": None}
-    description = daemon.ask("status")["description"]
-    assert (description["calibration"], description["pressure_max_kpa"]) == (None, 300)
-    assert "pressures are the description's" in daemon.listener.event(RELOADED)["detail"]
+    assert in_force() == (None, 300)
+    daemon.listener.wait("event", lambda e: "pressures are the description's" in e["detail"])
+    assert "calibration_refused" not in daemon.ask("status")["events"]["counts"]
 
 
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"sha256": "0" * 64}, "sha256 000000000000"),
-        ({"device_ids": ("skin-elsewhere",)}, "was made with skin-elsewhere, and bench-1 is"),
-        (None, "is damaged"),
-    ],
-)
-def test_one_that_cannot_be_used_leaves_the_one_in_force(
-    bench: Callable[..., Any], changes: dict[str, Any] | None, said: str
-) -> None:
+def test_one_that_cannot_be_used_leaves_the_one_in_force(bench: Start) -> None:
     made = kept()
     daemon = bench()
     daemon.tare()
-    if changes is None:
-        calibration_path("left").write_text("{")
-    else:
-        kept(**changes)
-    with pytest.raises(CalibrationRefused, match="what was in force stays so") as refusal:
-        daemon.ask("reload_calibration")
-    assert said in refusal.value.cause
-    assert said in daemon.listener.event("calibration_refused")["detail"]
+    for changes, said in (
+        ({"sha256": "0" * 64}, "sha256 000000000000"),
+        ({"device_ids": ("skin-elsewhere",)}, "was made with skin-elsewhere, and bench-1 is"),
+        (None, "is damaged"),
+    ):
+        if changes is None:
+            calibration_path("left").write_text("{")
+        else:
+            kept(**changes)
+        with pytest.raises(CalibrationRefused, match="what was in force stays so") as refusal:
+            daemon.ask("reload_calibration")
+        assert said in refusal.value.cause
+        daemon.listener.wait(
+            "event", lambda e, s=said: e["name"] == "calibration_refused" and s in e["detail"]
+        )
     status = daemon.ask("status")
     assert status["description"]["calibration"]["taken"] == made.taken
     assert status["events"]["counts"].get(RELOADED, 0) == 0
 
 
-def test_the_configured_file_is_the_one_that_is_read_again(
-    bench: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_the_configured_file_is_the_one_that_is_read_again(bench: Start, tmp_path: Path) -> None:
     kept(factor=2.0)
     configured = tmp_path / "configured.pressure.json"
     kept(configured)
@@ -200,21 +194,10 @@ def test_the_configured_file_is_the_one_that_is_read_again(
     assert status["description"]["pressure_max_kpa"] == pytest.approx(264)
 
 
-def test_another_device_is_judged_by_the_new_one(bench: Callable[..., Any]) -> None:
-    daemon = bench()
-    kept(device_ids=("bench-2",))
-    daemon.ask("reload_calibration")  # nobody has said yet who it is
-    daemon.tare()
-    daemon.listener.event("calibration_refused")
-    assert daemon.ask("status")["description"]["calibration"] is None
-    kept(device_ids=("bench-1", "bench-2"))
-    assert daemon.ask("reload_calibration")["calibration"]["readings"] == len(READINGS)
-
-
 class Pressed:
     """A skin that is pressed, and what the live daemon says of it."""
 
-    def __init__(self, bench: Callable[..., Any], **config: Any) -> None:
+    def __init__(self, bench: Start, **config: Any) -> None:
         self.bench = bench(**config)
         self.bench.tare()
         self._first = self.bench.skin.counter + 1
@@ -254,7 +237,7 @@ def pressures(frames: list[dict[str, Any]]) -> dict[int, list[float]]:
 
 @pytest.mark.slow
 def test_a_replay_goes_by_each_calibration_from_its_frame_on(
-    bench: Callable[..., Any], replay: Callable[..., Any], tmp_path: Path
+    bench: Start, replay: Start, tmp_path: Path
 ) -> None:
     pressed = Pressed(bench)
     path = tmp_path / "a.mcap"
@@ -281,8 +264,8 @@ def test_a_replay_goes_by_each_calibration_from_its_frame_on(
 
 @pytest.mark.slow
 def test_files_that_were_cut_replay_by_the_calibration_of_each(
-    bench: Callable[..., Any],
-    replay: Callable[..., Any],
+    bench: Start,
+    replay: Start,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -315,9 +298,7 @@ def test_files_that_were_cut_replay_by_the_calibration_of_each(
 
 
 @pytest.mark.slow
-def test_an_exact_replay_does_not_look_for_another(
-    bench: Callable[..., Any], tmp_path: Path
-) -> None:
+def test_an_exact_replay_does_not_look_for_another(bench: Start, tmp_path: Path) -> None:
     made = kept()
     b = bench(recording={"file": tmp_path / "press.mcap"})
     b.tare()
@@ -363,7 +344,7 @@ def taught(**changes: Any) -> TaughtSkin:
 
 
 @pytest.mark.slow
-def test_what_was_taught_is_found_by_the_sensors_name_and_told(bench: Callable[..., Any]) -> None:
+def test_what_was_taught_is_found_by_the_sensors_name_and_told(bench: Start) -> None:
     made = taught()
     daemon = bench()
     daemon.tare()
@@ -402,7 +383,7 @@ def test_what_was_taught_is_found_by_the_sensors_name_and_told(bench: Callable[.
     ],
 )
 def test_what_was_taught_on_another_skin_is_not_used(
-    bench: Callable[..., Any], changes: dict[str, Any] | None, said: str
+    bench: Start, changes: dict[str, Any] | None, said: str
 ) -> None:
     taught(**(changes or {}))
     if changes is None:
@@ -417,7 +398,7 @@ def test_what_was_taught_on_another_skin_is_not_used(
         daemon.ask("reload_calibration")
 
 
-def test_a_sheet_that_drifts_evenly_is_the_one_that_was_taught(bench: Callable[..., Any]) -> None:
+def test_a_sheet_that_drifts_evenly_is_the_one_that_was_taught(bench: Start) -> None:
     taught(reference=0.8 * np.stack([REST, REST]))
     daemon = bench()
     daemon.tare()

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
+from model_fixtures import Tared
 from noisy_skin import Skin, rms
 from tactomo_models import (
     Artifact,
@@ -60,25 +63,25 @@ class Bench:
         return np.array([np.sqrt(np.median(one / of)) for one in each])
 
 
-def test_a_scan_as_noisy_as_the_tare_has_the_tares_noise(
+@pytest.fixture
+def converter(
     paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator
-) -> None:
-    bench = Bench(paper, artifact, simulator)
+) -> Callable[..., Bench]:
+    return partial(Bench, paper, artifact, simulator)
+
+
+def test_a_scan_as_noisy_as_the_tare_has_the_tares_noise(converter: Callable[..., Bench]) -> None:
+    bench = converter()
     tare = bench.changes(NOISE).noise_variance
     assert (bench.ratios(NOISE, PRESS, of=tare) == 1).mean() >= 0.99
     assert (bench.ratios(NOISE / 4, PRESS, of=tare) == 1).all()
 
 
-@pytest.mark.parametrize("gain_spread", [0.0, 0.03])
-@pytest.mark.parametrize("times", [2.0, 6.0])
+@pytest.mark.parametrize(("times", "gain_spread"), [(2.0, 0.03), (6.0, 0.0)])
 def test_a_noisier_scan_has_its_own_noise_and_no_flag(
-    paper: SensorDescription,
-    artifact: Artifact,
-    simulator: SkinSimulator,
-    times: float,
-    gain_spread: float,
+    converter: Callable[..., Bench], times: float, gain_spread: float
 ) -> None:
-    bench = Bench(paper, artifact, simulator, gain_spread=gain_spread)
+    bench = converter(gain_spread=gain_spread)
     tare = bench.changes(NOISE).noise_variance
     ratios = bench.ratios(times * NOISE, of=tare)
     assert ratios.mean() == pytest.approx(times, rel=0.1)
@@ -86,12 +89,12 @@ def test_a_noisier_scan_has_its_own_noise_and_no_flag(
     assert all(bench.changes(times * NOISE).quiet for _ in range(200))
 
 
-@pytest.mark.parametrize("times", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize("times", [0.1, 10.0])
 def test_against_a_tare_of_one_scan_each_scan_tells_its_own(
-    paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator, times: float
+    converter: Callable[..., Bench], simulator: SkinSimulator, times: float
 ) -> None:
     """The reference's own noise is in every change; 104 pairs tell that of one scan to 8 %."""
-    bench = Bench(paper, artifact, simulator, scans=1)
+    bench = converter(scans=1)
     bench.changes(NOISE)  # the first frame, which tells the noise of a reference that has none
     clean = simulator.voltages(())[Channel.STRUCTURE]
     expected = (NOISE * rms(clean) / clean) ** 2 * (1 + times**2)
@@ -99,31 +102,28 @@ def test_against_a_tare_of_one_scan_each_scan_tells_its_own(
     assert ratios.mean() == pytest.approx(1, abs=0.25)
 
 
-def test_pressing_is_no_noise(
-    paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator
-) -> None:
+def test_pressing_is_no_noise(converter: Callable[..., Bench]) -> None:
     """Unequal gains break reciprocity by a share, of a voltage that pressing has changed, too."""
-    bench = Bench(paper, artifact, simulator, gain_spread=0.03)
+    bench = converter(gain_spread=0.03)
     tare = bench.changes(NOISE).noise_variance
     assert (bench.ratios(NOISE, PRESS, of=tare) == 1).mean() >= 0.99
 
 
 def test_noise_that_grows_with_the_change_is_explained(
-    paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator
+    tared: Tared, simulator: SkinSimulator
 ) -> None:
     """A reference of one scan without noise, and noise 40 dB under each frame's change."""
     rng = np.random.default_rng(3)
     rest = simulator.voltages(())
-    reconstructor = Reconstructor(paper, artifact)
-    reconstructor.set_reference(Reference(rest[Channel.MAGNITUDE], rest[Channel.STRUCTURE]))
+    reconstructor = tared(Reference(rest[Channel.MAGNITUDE], rest[Channel.STRUCTURE]))
     misfits = []
     for number in range(8):
         presses = [PRESS, Press(-0.04, 0.035, 190.0, 0.015)][: 1 + number // 4]
         volts = {
-            name: clean + 0.01 * rms(clean - rest[name]) * rng.standard_normal(len(clean))
+            str(name): clean + 0.01 * rms(clean - rest[name]) * rng.standard_normal(len(clean))
             for name, clean in simulator.voltages(presses).items()
         }
-        frame = reconstructor.reconstruct(volts[Channel.MAGNITUDE], volts[Channel.STRUCTURE])
+        frame = reconstructor.reconstruct(**volts)
         assert frame.tier == "fit"
         assert len(frame.contacts) == len(presses)
         misfits.append(frame.misfit)
@@ -131,12 +131,7 @@ def test_noise_that_grows_with_the_change_is_explained(
     assert max(misfits) < 1.3
 
 
-def test_channels_of_one_frame_differ_in_noise(
-    paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator
-) -> None:
-    skin = Skin(simulator)
-    reconstructor = Reconstructor(paper, artifact)
-    reconstructor.set_reference(skin.reference())
+def test_channels_of_one_frame_differ_in_noise(reconstructor: Reconstructor, skin: Skin) -> None:
     rng = np.random.default_rng(2)
     scan, quiet = skin.scan(PRESS), skin.scan(PRESS)
     volts = scan["magnitude"]
