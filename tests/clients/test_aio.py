@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from typing import Any
 
 import pytest
+import uvloop
 from fake_control import FakeControl
 from tactomo_client import (
     Contact,
@@ -26,9 +27,7 @@ PATIENCE_S = 30.0
 @pytest.fixture(params=["asyncio", "uvloop"])
 def run(request: pytest.FixtureRequest) -> Run:
     """Run a coroutine in an event loop of this make; nothing of it may be left open."""
-    factory = None
-    if request.param == "uvloop":
-        factory = pytest.importorskip("uvloop").new_event_loop
+    factory = uvloop.new_event_loop if request.param == "uvloop" else None
 
     def run_in_loop(main: Coroutine[Any, Any, None]) -> None:
         with asyncio.Runner(loop_factory=factory, debug=True) as runner:

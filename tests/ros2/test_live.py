@@ -10,12 +10,9 @@ from tactomo.imaging.frames import description_fields
 from tactomo_client import Contact, subscribe
 from tactomo_client.fake import FakeSensor
 from tactomo_models import load_description
-from variants import variant
-
-pytest.importorskip("rosbags")
-
 from tactomo_ros2.live import run
 from tactomo_ros2.messages import TYPES, RosMessage
+from variants import variant
 
 HUMS = {"severity": "error", "what": "it hums", "next_step": "oil it"}
 CREAKS = {"severity": "warning", "what": "it creaks", "next_step": "leave it"}

@@ -42,11 +42,20 @@ def volts(host: Any, scan: Scan, port: int = 0) -> float:
     return float(np.mean(scan.volts(host.kind(Hello, port)[-1].volts_per_count)))
 
 
-def test_identify_is_acknowledged_and_answered_with_a_hello(bench: Start) -> None:
+def test_what_the_device_is_asked_it_does_or_refuses(bench: Start) -> None:
     host = bench().host()
     host.send(CommandCode.IDENTIFY, request=77)
-    host.wait_for(lambda: host.kind(Hello) and host.kind(Acknowledge))
-    assert host.kind(Acknowledge) == [Acknowledge(77, CommandCode.IDENTIFY, AckStatus.OK)]
+    host.send(CommandCode.SET_RATE, 1, rate_hz=1e6)
+    host.send(99, 2)
+    host.send(CommandCode.SET_RATE, 3, rate_hz=1e-9)  # slower than it can
+    host.wait_for(lambda: len(host.kind(Acknowledge)) == 4)
+    assert host.kind(Acknowledge) == [
+        Acknowledge(77, CommandCode.IDENTIFY, AckStatus.OK),
+        Acknowledge(1, CommandCode.SET_RATE, AckStatus.BAD_ARGUMENT),
+        Acknowledge(2, 99, AckStatus.UNKNOWN_COMMAND),
+        Acknowledge(3, CommandCode.SET_RATE, AckStatus.OK),
+    ]
+    host.wait_for(lambda: RATE_HZ_MIN in [hello.scan_rate_hz for hello in host.kind(Hello)])
     hello = host.kind(Hello)[-1]
     assert hello.device_id.startswith("twin")
     assert hello.channels == (Channel.MAGNITUDE, Channel.STRUCTURE)
@@ -73,14 +82,6 @@ def test_one_port_carries_both_channels_of_the_same_instant(bench: Start) -> Non
     assert host.decoders[0].counts.corrupt == 0
 
 
-def test_a_follower_states_no_rate_of_its_own(bench: Start) -> None:
-    """PROTOCOL.md: its pulses come from the leader."""
-    host = bench(ports=2).host()
-    host.wait_for(lambda: host.kind(Hello, 0) and host.kind(Hello, 1))
-    assert host.kind(Hello, 0)[-1].scan_rate_hz > 0
-    assert host.kind(Hello, 1)[-1].scan_rate_hz == 0
-
-
 def test_a_press_off_the_sheet_is_refused_with_its_size(bench: Start) -> None:
     twin = bench()
     for x_mm, y_mm in ((100, 0), (0, -1000)):
@@ -92,12 +93,17 @@ def test_a_press_off_the_sheet_is_refused_with_its_size(bench: Start) -> None:
     twin.ask("press", x_mm=85, y_mm=0)  # its rim is still on it
 
 
-def test_two_ports_share_counter_and_stamp(bench: Start) -> None:
+def test_two_ports_share_counter_and_stamp_and_each_starts_by_itself(bench: Start) -> None:
     host = bench(ports=2).host()
-    host.start()
-    host.wait_for(lambda: len(host.scans(0)) >= 5 and len(host.scans(1)) >= 5)
+    host.send(CommandCode.START, port=0)
+    host.wait_for(lambda: len(host.scans(0)) >= 20 and host.kind(Hello, 1))
+    assert host.scans(1) == []
+    assert host.kind(Hello, 0)[-1].scan_rate_hz > 0
+    assert host.kind(Hello, 1)[-1].scan_rate_hz == 0  # PROTOCOL.md: the leader gives the pulses
+    host.send(CommandCode.START, port=1)
+    host.wait_for(lambda: len(host.scans(1)) >= 5)
+    host.wait_for(lambda: host.scans(0)[-1].counter >= host.scans(1)[-1].counter)
     for port, channel in enumerate(Channel):
-        host.wait_for(lambda port=port: host.kind(Hello, port))
         assert host.kind(Hello, port)[-1].channels == (channel,)
         assert {scan.channel for scan in host.scans(port)} == {channel}
     stamps = [{scan.counter: scan.device_us for scan in host.scans(port)} for port in (0, 1)]
@@ -134,25 +140,6 @@ def test_rate_stop_and_zero_counters(bench: Start) -> None:
     assert after[0].counter == 0
 
 
-def test_what_the_device_cannot_do_is_refused(bench: Start) -> None:
-    host = bench().host()
-    host.send(CommandCode.SET_RATE, 1, rate_hz=1e6)
-    host.send(99, 2)
-    host.wait_for(lambda: len(host.kind(Acknowledge)) == 2)
-    assert [a.status for a in host.kind(Acknowledge)] == [
-        AckStatus.BAD_ARGUMENT,
-        AckStatus.UNKNOWN_COMMAND,
-    ]
-
-
-def test_a_rate_slower_than_it_can_is_its_slowest(bench: Start) -> None:
-    host = bench().host()
-    host.send(CommandCode.SET_RATE, 1, rate_hz=1e-9)
-    host.wait_for(lambda: host.kind(Acknowledge))
-    assert host.kind(Acknowledge)[0].status == AckStatus.OK
-    host.wait_for(lambda: RATE_HZ_MIN in [hello.scan_rate_hz for hello in host.kind(Hello)])
-
-
 def test_a_scan_that_takes_longer_is_late_and_says_so(bench: Start) -> None:
     host = bench(solve_s=0.15, rate_hz=10.0).host()
     host.start()
@@ -184,13 +171,6 @@ def test_scans_missed_in_a_stall_are_not_made_up(bench: Start) -> None:
     assert stamps_us[1] - stamps_us[0] >= 500_000
     soon_after = np.count_nonzero(stamps_us[1:] < stamps_us[1] + 100_000)
     assert soon_after <= 12  # ten a tenth of a second; 60 if the stall were made up for
-
-
-def test_each_port_starts_by_itself(bench: Start) -> None:
-    host = bench(ports=2).host()
-    host.send(CommandCode.START, port=0)
-    host.wait_for(lambda: len(host.scans(0)) >= 20 and host.kind(Hello, 1))
-    assert host.scans(1) == []
 
 
 def test_a_program_that_knows_nothing_of_terminals_reads_the_bytes_as_they_are(
@@ -416,14 +396,13 @@ def test_unplug_and_replug_by_a_stable_link(bench: Start, tmp_path: Path) -> Non
     assert again.scans()[0].channel == Channel.STRUCTURE
 
 
-def test_links_are_removed_at_the_end(bench: Start, tmp_path: Path) -> None:
+def test_links_are_removed_at_the_end_and_files_of_the_user_stay(
+    bench: Start, tmp_path: Path
+) -> None:
     started = bench(link_folder=tmp_path)
     assert os.readlink(tmp_path / "skin").startswith("/dev/")
     started.twin.stop()
     assert not os.path.lexists(tmp_path / "skin")
-
-
-def test_a_link_over_a_file_of_the_user_is_refused(bench: Start, tmp_path: Path) -> None:
     (tmp_path / "skin").write_text("precious")
     with pytest.raises(TactomoError, match="cannot make the link"):
         bench(link_folder=tmp_path)
@@ -449,12 +428,11 @@ def test_wrong_commands_are_refused(bench: Start) -> None:
             started.ask(command, **arguments)
         assert says in str(caught.value)
     assert started.ask("status")["counter"] == 0
-
-
-def test_a_busy_control_address_is_named(bench: Start) -> None:
-    first = bench()
+    press = encode_request("press", {"x_mm": 0.0, "y_mm": 0.0})
+    assert b"ok" not in post(started.twin.control, [b"", press])  # by a web page
+    assert started.ask("scene")["presses"] == []
     with pytest.raises(AddressError, match="in use"):
-        bench(control=first.twin.control)
+        bench(control=started.twin.control)
 
 
 class BreakingSkin:
@@ -504,10 +482,3 @@ def test_more_voltages_than_a_scan_can_have_are_told_at_the_start(
 def test_a_sensor_of_one_channel_has_no_two_ports() -> None:
     with pytest.raises(ConfigError, match="1 channel"):
         TwinConfig(load_description("tank_disc"), ports=2)
-
-
-def test_a_web_pages_press_is_not_obeyed(bench: Start) -> None:
-    b = bench()
-    press = encode_request("press", {"x_mm": 0.0, "y_mm": 0.0})
-    assert b"ok" not in post(b.twin.control, [b"", press])
-    assert b.ask("scene")["presses"] == []

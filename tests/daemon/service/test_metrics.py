@@ -14,12 +14,11 @@ from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 import pytest
+from prometheus_client import parser
 from tactomo.config import load_config
 from tactomo.errors import AddressError, ConfigError
 from tactomo.service import metrics
 from waiting import PATIENCE_S
-
-parser = pytest.importorskip("prometheus_client.parser")
 
 RULES = Path(__file__).parents[3] / "deploy/prometheus/tactomo.rules.yml"
 ANYWHERE = "127.0.0.1:0"

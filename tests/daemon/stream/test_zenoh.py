@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -25,6 +24,7 @@ import pytest
 import zenoh
 from hostile_page import SUBSCRIBE, post
 from logged_process import LoggedProcess, next_of
+from needs import need
 from page import Page
 from tactomo.stream import zenoh_bridge
 from tactomo.stream.zenoh_publication import ENCODING, HEARTBEAT_S, STATUS_HEARTBEAT_S
@@ -430,6 +430,7 @@ def test_without_a_configuration_the_two_meet_on_this_computer(
 
 def certificates(folder: Path, *names: str) -> None:
     """Make an authority and, by it, a certificate of `localhost` for each name."""
+    need("openssl")
 
     def openssl(*words: object) -> None:
         subprocess.run(["openssl", *map(str, words)], cwd=folder, check=True, capture_output=True)
@@ -455,7 +456,6 @@ def example(name: str, folder: Path, port: int) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not shutil.which("openssl"), reason="needs openssl to make certificates")
 def test_the_examples_let_a_listed_certificate_read_and_no_more(
     left: FakeSensor, tmp_path: Path
 ) -> None:

@@ -7,6 +7,8 @@ import pytest
 import skfem
 from hypothesis import given
 from hypothesis import strategies as st
+from pyeit.eit import fem, protocol  # type: ignore[import-untyped]
+from pyeit.mesh import PyEITMesh  # type: ignore[import-untyped]
 from tactomo_models import Artifact, SensorDescription, load_description
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.bare_sheet import (
@@ -326,9 +328,6 @@ def test_small_electrodes_agree_with_pyeits_point_electrodes(small: SensorDescri
     the voltages and in what a mild contact changes. No scale is fitted; pyEIT's voltages are
     V(m + 1) - V(m).
     """
-    fem = pytest.importorskip("pyeit.eit.fem")
-    protocol = pytest.importorskip("pyeit.eit.protocol")
-    pyeit_mesh = pytest.importorskip("pyeit.mesh")
     differences = []
     for length_m in (0.002, 0.001):
         sensor = variant(small, electrodes={"length_m": length_m})
@@ -340,7 +339,7 @@ def test_small_electrodes_agree_with_pyeits_point_electrodes(small: SensorDescri
         triangles[clockwise] = triangles[clockwise, ::-1]
         distance = np.linalg.norm(points.T[:, None] - sensor.electrode_centres_m, axis=2)
         assert distance.min(axis=0).max() < 1e-9
-        mesh = pyeit_mesh.PyEITMesh(
+        mesh = PyEITMesh(
             node=points.T,
             element=triangles,
             perm=np.ones(len(triangles)),

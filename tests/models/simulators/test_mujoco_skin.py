@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from page import Page
 from tactomo_models import DataError, load_description
+from tactomo_models.simulators.gymnasium_skin import TactileObservation
+from tactomo_models.simulators.mujoco_skin import MujocoSkin, Touch
 from variants import variant
-
-mujoco = pytest.importorskip("mujoco")
-gymnasium = pytest.importorskip("gymnasium")
-
-from tactomo_models.simulators.gymnasium_skin import TactileObservation  # noqa: E402
-from tactomo_models.simulators.mujoco_skin import MujocoSkin, Touch  # noqa: E402
 
 STEPS = 300
 CELL_M2 = 0.003**2
