@@ -21,6 +21,15 @@ Volts = dict[Channel, FloatArray]
 """Voltages (M,) of each channel that a dual scan has."""
 
 
+class Felt(NamedTuple):
+    """What a companion says of a scan."""
+
+    name: str
+    value: float  # in its own unit; NaN where its device clipped
+    since_us: int
+    """For how long the sheets must have been still for that; 0 or less where it is no matter."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ChannelScan:
     """One channel's scan as it came in."""
@@ -38,6 +47,7 @@ class ChannelScan:
     port: int = 0  # index of the port that the scan came by
     delay_ns: int | None = None
     """How long the scan was held up on its way; None while the device's clock cannot tell."""
+    companions: tuple[Felt, ...] = ()  # of its port
 
     @property
     def acquired_ns(self) -> int:
@@ -117,6 +127,11 @@ class DualScan:
     def scans(self) -> tuple[ChannelScan, ...]:
         """Those that are there, magnitude first."""
         return tuple(scan for scan in (self.magnitude, self.structure) if scan is not None)
+
+    @property
+    def companions(self) -> dict[str, Felt]:
+        """What each companion that was heard says of it."""
+        return {felt.name: felt for scan in self.scans for felt in scan.companions}
 
     @property
     def last(self) -> ChannelScan:

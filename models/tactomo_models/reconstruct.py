@@ -25,6 +25,7 @@ from tactomo_models.methods.magnitudes import BAD_MISFIT
 from tactomo_models.methods.method import Estimate, Method, Skin, UnsolvableError
 from tactomo_models.methods.registry import check_method, make_method
 from tactomo_models.physics.artifact import Artifact
+from tactomo_models.scans.companion_forces import CompanionReading
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scans.reference import Reference
@@ -187,7 +188,7 @@ class Reconstructor:
         structure: FloatArray | None,
         *,
         saturated: Collection[Channel] = (),
-        companions: Collection[tuple[str, float]] | None = None,
+        companions: Collection[tuple[str, float] | CompanionReading] | None = None,
     ) -> Reconstruction:
         """Reconstruct one frame.
 
@@ -196,7 +197,7 @@ class Reconstructor:
             structure: (M,) volts; None if that scan is missing.
             saturated: channels whose device says that its converter clipped this scan.
             companions: name of each companion and its reading in its own unit, NaN where it has
-                none; None where nobody reads them.
+                none, or `CompanionReading`; None where nobody reads them.
 
         Raises:
             DataError: a scan has another number of voltages than the sensor.
@@ -210,7 +211,7 @@ class Reconstructor:
         structure: FloatArray | None,
         *,
         saturated: Collection[Channel] = (),
-        companions: Collection[tuple[str, float]] | None = None,
+        companions: Collection[tuple[str, float] | CompanionReading] | None = None,
     ) -> Measurement:
         """The first half of `reconstruct`, which costs little: what has changed."""
         if self._tare.asks_noise:

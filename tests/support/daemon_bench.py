@@ -25,6 +25,7 @@ from tactomo_client.keys import secure
 from tactomo_client.messages import KINDS, Message, decode_message, topic
 from tactomo_models import Contact, Flag, Reconstruction, Reference
 from tactomo_models.arrays import FloatArray, Image
+from tactomo_models.scans.companion_forces import CompanionReading
 from tactomo_models.scene.pressure import PressureCurve
 from tactomo_protocol import (
     Channel,
@@ -248,7 +249,9 @@ class Memory:
         structure: FloatArray | None,
         *,
         saturated: Collection[Channel] = (),
+        companions: Collection[CompanionReading] = (),
     ) -> Reconstruction:
+        assert not companions
         self.budgets_s.append(self.budget_s)
         time.sleep(self.seconds)
         flags = Flag.SATURATED if saturated else Flag(0)

@@ -344,6 +344,12 @@ class Events:
     #: Scans of one channel are missing; maps continue from the other channel
     channel_lost = EventKind("warning", end="channel_back")
     channel_back = INFO  #: The missing channel sends scans again
+    #: A companion of the sensor description has had no reading within its limits for 1 s: see the
+    #: flag ``companion_missing``
+    companion_lost = EventKind("warning", end="companion_back")
+    companion_back = INFO  #: The companion reads again within its limits
+    #: A device sends readings of a companion whose index the sensor description does not have
+    companion_unknown = EventKind("warning", period_s=600.0)
     #: Scans of one channel repeat bit for bit while their counter rises, although they had noise at
     #: the tare: the daemon treats them as missing. Of drives or measuring pairs that repeat, the
     #: daemon leaves out those alone (``invalid_voltage``). A converter that is frozen during the

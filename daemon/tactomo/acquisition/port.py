@@ -23,6 +23,7 @@ from tactomo_protocol import (
     AckStatus,
     Channel,
     CommandCode,
+    CompanionReading,
     DecoderCounts,
     Hello,
     Packet,
@@ -30,6 +31,7 @@ from tactomo_protocol import (
 )
 
 from tactomo.acquisition.adapters import ROOT
+from tactomo.acquisition.companion_log import CompanionLog
 from tactomo.acquisition.connection import Connection
 from tactomo.acquisition.device_clock import MAX_RATE, ClockState, DeviceClock
 from tactomo.acquisition.liveness import DeviceState, Liveness
@@ -101,6 +103,7 @@ class PortReader(Worker):
         self.refusal = ""  # why this device's scans are not used; empty when they are
         self.reopened = 0  # how often the port was opened again because the device did not speak
         self.clock = DeviceClock()  # the device's, by which its scans are dated
+        self._companions = CompanionLog(description)
         self.has_ended = False  # whether the replay behind the port is at its end
         self._baud = baud
         self._description = description
@@ -229,6 +232,7 @@ class PortReader(Worker):
         """Make a new start with whichever device is at the port now."""
         self._is_known = False
         self._unanswered_s = None
+        self._companions.forget()
         self._protocol.restart()
         self._liveness.opened(time.monotonic())
         self._ask()
@@ -286,6 +290,7 @@ class PortReader(Worker):
                         self.clock.date(packet.channel, packet.device_us, clock_ns)
                         if self.has_clock
                         else None,
+                        self._companions.at(packet.device_us),
                     )
                 )
         intact = self.counts.packets + self.counts.faulty - understood
@@ -348,7 +353,18 @@ class PortReader(Worker):
                 elif packet.channel in self._description.channels:
                     return packet.volts(hello.volts_per_count)
             self.unused += 1
+        elif isinstance(packet, CompanionReading) and self._is_known and not self.refusal:
+            self._take_reading(packet)
         return None
+
+    def _take_reading(self, packet: CompanionReading) -> None:
+        if not self._companions.take(packet):
+            self._tell(
+                "companion_unknown",
+                f"readings of companion {packet.index} come, and the sensor description has none "
+                "of that index",
+                f"add [companion.NAME] with index = {packet.index} to the description",
+            )
 
     def _note_fault(self, fault: str, now_s: float) -> None:
         """Take note of, and tell, what a device's firmware does against its protocol."""
@@ -496,6 +512,7 @@ class PortReader(Worker):
     def _begin_pass(self, number: int) -> None:
         """Go on elsewhere in the recording: what had begun to come is not finished."""
         self._pass, self.has_ended = number, False
+        self._companions.forget()
         self._protocol.restart()
         self.clock = DeviceClock()
         self._clock_seen = (self.clock.state, 0)

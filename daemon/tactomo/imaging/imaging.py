@@ -25,6 +25,7 @@ from tactomo_models.calibration.calibration_file import PressureCalibration
 from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_models.commissioning.known_skin import SkinAtStart, skin_at_start
 from tactomo_models.methods.machine_speed import MachineSpeed
+from tactomo_models.scans.companion_forces import CompanionReading
 from tactomo_models.scans.tare import Tare
 from tactomo_protocol import Channel, ScanFlag
 
@@ -32,6 +33,7 @@ from tactomo.config import BaselineConfig
 from tactomo.events import OnEvent
 from tactomo.imaging import frames
 from tactomo.imaging.calibration_in_force import CalibrationInForce
+from tactomo.imaging.companions import Companions
 from tactomo.imaging.frame_marks import FrameMarks, InForce
 from tactomo.imaging.frozen_converter import FrozenConverters
 from tactomo.imaging.kept_reference import KeptReference, KnownSkin
@@ -106,6 +108,7 @@ class Imaging:
             on_event,
         )
         self._frozen = FrozenConverters(description.pairs, on_event)
+        self._companions = Companions(description, on_event)
         self._kept = kept
         self._doubt: Doubt | None = None  # about the reference in force
         self._recorder = recorder
@@ -229,6 +232,7 @@ class Imaging:
     def forget(self) -> None:
         """Take the next dual scan for the first one: it does not follow on those before."""
         self._reconstructor.reset()
+        self._companions.forget()
         self._has_moved = True
         self._publisher.tell_status()
 
@@ -257,6 +261,7 @@ class Imaging:
         if self._marks.follow(dual):
             # Which contacts are which is not forgotten: whoever follows one need not know of this.
             self._reconstructor.forget_shape()
+            self._companions.forget()
         volts = {scan.channel: scan.volts for scan in dual.scans}
         self._publish_scan(dual, timing, volts)
         volts = self._frozen.without(volts, self.reference)
@@ -264,7 +269,8 @@ class Imaging:
         if before is not None and is_at_rest(volts, before.reference):
             self._restore(before)
         clipped = [scan.channel for scan in dual.scans if scan.flags & ScanFlag.SATURATED]
-        frame = self._reconstruct(volts, clipped, is_exact=mark is not None)
+        companions = self._companions.read(dual, volts, self.reference)
+        frame = self._reconstruct(volts, clipped, companions, is_exact=mark is not None)
         if frame is not None and self._doubt is not None:
             frame = self._doubted(frame, self._doubt)
         self._marks.mark(dual, timing, self.in_force)  # first: what was seen is recorded
@@ -274,7 +280,7 @@ class Imaging:
         if frame is not None:
             self._contacts = len(frame.contacts)
             self._publish_frame(dual, timing, frame)
-        self.taring.add(volts, lost, self._contacts)
+        self.taring.add(volts, lost, self._contacts, companions)
 
     def share_processor(self, dropped: int) -> None:
         """Give frames less time where others take the processor, and more where they do no longer.
@@ -326,13 +332,20 @@ class Imaging:
             self._reconstructor.reset()
         if mark.is_cut:
             self._reconstructor.forget_shape()
+        if mark.is_cold or mark.is_cut:
+            self._companions.forget()
         self.calibration.obey(mark.calibration)
         if mark.reference is not None and mark.reference is not self.reference:
             self._reconstructor.set_reference(mark.reference)
             self._note_reference(KnownSkin(mark.reference, wall_clock_ns()))
 
     def _reconstruct(
-        self, volts: Volts, saturated: list[Channel], *, is_exact: bool
+        self,
+        volts: Volts,
+        saturated: list[Channel],
+        companions: list[CompanionReading],
+        *,
+        is_exact: bool,
     ) -> Reconstruction | None:
         """Make a frame; where it is exact, against the reference that the recording had then."""
         started_s, cpu_s = time.perf_counter(), time.thread_time()
@@ -340,10 +353,14 @@ class Imaging:
         scans = (volts.get(Channel.MAGNITUDE), volts.get(Channel.STRUCTURE))
         try:
             if self._tracker is None or is_exact:
-                frame = self._reconstructor.reconstruct(*scans, saturated=saturated)
+                frame = self._reconstructor.reconstruct(
+                    *scans, saturated=saturated, companions=companions
+                )
             else:
                 acquired_s = self.acquired_monotonic_ns * 1e-9
-                frame = self._tracker.reconstruct(acquired_s, *scans, saturated=saturated)
+                frame = self._tracker.reconstruct(
+                    acquired_s, *scans, saturated=saturated, companions=companions
+                )
                 self._follow(self._tracker)
         except Exception as error:  # a robot is better off with the next frame than with none
             self._reconstructor.reset()

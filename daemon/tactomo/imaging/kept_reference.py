@@ -22,6 +22,8 @@ from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import REFERENCE_ARRAYS
 from tactomo.timing import wall_clock_ns
 
+COMPANION: Final = "companion_"
+"""Before the name of each companion whose reading at rest is kept."""
 KEEP_S: Final = 60.0
 """How often a reference that follows drift is kept: drift bounds allow for far more than that."""
 UNKNOWN_S: Final = 86_400.0
@@ -95,6 +97,7 @@ class KeptReference:
         arrays: dict[str, Any] = {
             name: volts for name in REFERENCE_ARRAYS if (volts := getattr(now, name)) is not None
         }
+        arrays |= {f"{COMPANION}{name}": value for name, value in now.companions or ()}
         sha256, *devices = self._about(device_ids)
         about = {"description_sha256": sha256, "device_ids": np.array(devices, "U")}
         arrays |= {**about, "scans": now.scans, "realtime_ns": wall_clock_ns()}
@@ -120,7 +123,19 @@ class KeptReference:
         if not any(name in volts for name in self._description.channels):
             raise ValueError("it holds no channel of this sensor")
         both = {name: volts.get(name) for name in REFERENCE_ARRAYS}
-        return Reference(scans=max(1, int(arrays["scans"])), is_noise_measured=True, **both)
+        companions = tuple(
+            (key.removeprefix(COMPANION), float(value))
+            for key, value in arrays.items()
+            if key.startswith(COMPANION)
+        )
+        if not all(np.isfinite(reading) for _, reading in companions):
+            raise ValueError("a companion's reading is no number")
+        return Reference(
+            scans=max(1, int(arrays["scans"])),
+            is_noise_measured=True,
+            companions=companions or None,
+            **both,
+        )
 
     def _write(self, arrays: dict[str, Any]) -> None:
         try:

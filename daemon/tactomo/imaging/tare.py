@@ -15,11 +15,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from tactomo_models import ModelError, Reference
 from tactomo_models.arrays import FloatArray
+from tactomo_models.scans.companion_forces import CompanionReading
 from tactomo_models.scans.tare import Tare
 from tactomo_protocol import Channel
 
@@ -129,13 +131,20 @@ class Taring:
                 ),
             )
 
-    def add(self, volts: dict[Channel, Volts], lost: Collection[Channel], contacts: int) -> None:
+    def add(
+        self,
+        volts: dict[Channel, Volts],
+        lost: Collection[Channel],
+        contacts: int,
+        companions: Collection[CompanionReading] = (),
+    ) -> None:
         """Take one dual scan, if a reference is being taken; with enough, put it in force.
 
         Args:
             volts: (M,) of each channel that is there.
             lost: channels that are not to be expected.
             contacts: how many were shown in this frame.
+            companions: their readings.
         """
         tare = self._tare
         needed = {channel for channel in self._channels if channel not in lost}
@@ -143,7 +152,7 @@ class Taring:
             return
         self._put_off()
         tare.contacts = max(tare.contacts, contacts)
-        if not tare.add(volts, needed):
+        if not tare.add(volts, needed, companions):
             return
         self._tare = None
         try:
@@ -200,9 +209,18 @@ class _Scans:
         self.contacts = 0  # how many were shown meanwhile, at most
         self._wanted = scans
         self._volts: dict[Channel, list[Volts]] = {}
+        self._readings: dict[str, list[float]] = {}  # of companions
 
-    def add(self, volts: dict[Channel, Volts], needed: Collection[Channel]) -> bool:
+    def add(
+        self,
+        volts: dict[Channel, Volts],
+        needed: Collection[Channel],
+        companions: Collection[CompanionReading],
+    ) -> bool:
         """Take one dual scan; returns whether there are enough of every needed channel now."""
+        for reading in companions:
+            if np.isfinite(reading.value):
+                self._readings.setdefault(reading.name, []).append(reading.value)
         for channel, values in volts.items():
             self._volts.setdefault(channel, []).append(values)
         return all(len(self._volts.get(channel, ())) >= self._wanted for channel in needed)
@@ -223,7 +241,9 @@ class _Scans:
                     "take the load off the skin, then tare again",
                     "tare_refused",
                 )
-        return Reference.from_scans(stacks.get(Channel.MAGNITUDE), stacks.get(Channel.STRUCTURE))
+        sheets = map(stacks.get, (Channel.MAGNITUDE, Channel.STRUCTURE))
+        at_rest = tuple((name, float(np.mean(each))) for name, each in self._readings.items())
+        return replace(Reference.from_scans(*sheets), companions=at_rest or None)
 
 
 def is_at_rest(volts: Mapping[Channel, Volts], reference: Reference) -> bool:

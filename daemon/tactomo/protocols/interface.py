@@ -8,8 +8,9 @@ nothing behind the port knows of another one.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from tactomo_protocol import (
     MAX_DEVICE_US,
     MAX_SAMPLES,
     SCAN_COUNTERS,
+    CompanionReading,
     Decoder,
     DecoderCounts,
     Hello,
@@ -31,6 +33,9 @@ from tactomo_protocol import (
 )
 
 from tactomo.errors import ConfigError
+
+KEPT_READINGS: Final = 32
+"""Readings of each companion that a scan may be held against: those that come while it is taken."""
 
 
 class Trouble(NamedTuple):
@@ -112,6 +117,8 @@ class Reading(NamedTuple):
 
     volts: FloatArray  #: (M,) in the description's order
     device_us: int = 0  #: by its clock; 0 where it has none
+    #: readings of the description's companions by their names; NaN for one that has none now
+    companions: Mapping[str, float] = MappingProxyType({})
 
 
 _POSITION: Final = struct.Struct("<IQB")
@@ -193,6 +200,7 @@ class ForeignProtocol(PortProtocol):
                 if self._is_hello_due:
                     packets.append(self.hello())
                     self._has_greeted, self._is_hello_due = True, False
+                packets += self._companions_of(reading)
                 packets.append(scan)
                 if self.trouble is self._failure:
                     self.trouble = None
@@ -254,6 +262,13 @@ class ForeignProtocol(PortProtocol):
         self.device_us = reading.device_us
         counter, self._counter = self._counter, (self._counter + 1) % SCAN_COUNTERS
         return Scan(self._channel, counter, reading.device_us, ScanFlag(0), samples)
+
+    def _companions_of(self, reading: Reading) -> Iterator[CompanionReading]:
+        indices = {name: index for index, name in self.description.companion_indices.items()}
+        for name, value in reading.companions.items():
+            if name not in indices:
+                raise ValueError(f"{self.description.name} has no companion {name}")
+            yield CompanionReading(indices[name], ScanFlag(0), reading.device_us, float(value))
 
     def _resume(self, data: bytes, packets: list[Packet]) -> bytes:
         """Take a recording's preamble, if `data` is one; return what comes after it.

@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 
 from tactomo_models import SensorDescription
-from tactomo_protocol import MAX_FRAME_BYTES, Command, CommandCode, Decoder, Hello, Packet, encode
+from tactomo_protocol import (
+    MAX_FRAME_BYTES,
+    Command,
+    CommandCode,
+    CompanionReading,
+    Decoder,
+    Hello,
+    Packet,
+    encode,
+)
 
-from tactomo.protocols.interface import PortProtocol, check_scan_fits
+from tactomo.protocols.interface import KEPT_READINGS, PortProtocol, check_scan_fits
 
 
 class NativeProtocol(PortProtocol):
@@ -27,6 +37,8 @@ class NativeProtocol(PortProtocol):
         self._decoder = Decoder()
         self.counts = self._decoder.counts
         self._hello: Hello | None = None
+        # the newest readings, by their companion's index
+        self._readings: dict[int, deque[CompanionReading]] = {}
         self._tail = b""  # bytes from the last delimiter on, where a recording may begin
         self._request = 0
 
@@ -38,6 +50,9 @@ class NativeProtocol(PortProtocol):
         for packet in packets:
             if isinstance(packet, Hello):
                 self._hello = packet
+            elif isinstance(packet, CompanionReading):
+                kept = self._readings.setdefault(packet.index, deque(maxlen=KEPT_READINGS))
+                kept.append(packet)
         self.fault = self._decoder.fault
         return packets
 
@@ -55,8 +70,11 @@ class NativeProtocol(PortProtocol):
         self._decoder.restart()
 
     def preamble(self) -> bytes:
-        """Return the hello in force and the packet that has begun."""
-        return (b"" if self._hello is None else encode(self._hello)) + self._tail
+        """Return the hello in force, companions' newest readings, and the packet that has begun."""
+        if self._hello is None:
+            return self._tail
+        readings = (encode(each) for kept in self._readings.values() for each in kept)
+        return encode(self._hello) + b"".join(readings) + self._tail
 
     @classmethod
     def recognises(cls, data: bytes) -> bool:

@@ -40,6 +40,7 @@ lies beyond damage in the middle is for `recovery`.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -396,7 +397,24 @@ def _read_reference(data: bytes) -> Reference:
         }
     except MessageError as error:
         raise _malformed() from error
-    return Reference(scans=_integer(fields["scans"]), is_noise_measured=True, **arrays)
+    return Reference(
+        scans=_integer(fields["scans"]),
+        is_noise_measured=True,
+        companions=_at_rest(fields.get("companions")),
+        **arrays,
+    )
+
+
+def _at_rest(readings: Any) -> tuple[tuple[str, float], ...] | None:
+    """Return a reference's readings of companions; None where there are none."""
+    if readings is None:
+        return None
+    if not isinstance(readings, dict) or not all(
+        isinstance(name, str) and isinstance(value, float) and math.isfinite(value)
+        for name, value in readings.items()
+    ):
+        raise _malformed()
+    return tuple(readings.items())
 
 
 def read_reference_number(data: bytes) -> int | None:

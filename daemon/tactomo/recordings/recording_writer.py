@@ -63,6 +63,8 @@ def reference_entry(
         array = getattr(reference, name)
         if array is not None or name in REFERENCE_ARRAYS:
             fields[name] = None if array is None else array_to_wire(array)
+    if reference.companions:
+        fields["companions"] = dict(reference.companions)
     return Entry("reference", msgpack.packb(fields), monotonic_ns, realtime_ns)
 
 

@@ -171,7 +171,7 @@ def _of_flags(status: Mapping[str, Any]) -> Iterator[HealthIssue]:
         what, step = FLAG_ADVICE[flag]
         if flag == "no_reference" and status.get("state") == "taring":
             severity, what, step = TARING
-        is_explained = flag in ("electrode_fault", "misfit_high")
+        is_explained = flag in ("electrode_fault", "misfit_high") or flag.startswith("companion_")
         because = status.get("tier_reason") if is_explained else None
         yield HealthIssue(severity, f"{what} ({because})" if because else what, step)
 

@@ -25,7 +25,7 @@ from pydantic import TypeAdapter, ValidationError
 from tactomo_client.messages import DEFAULT_TWIN_CONTROL
 from tactomo_models import Press, SensorDescription, SkinSimulator
 from tactomo_models.simulation.skin_drift import DriftingSkin, SkinDrift
-from tactomo_protocol import Channel
+from tactomo_protocol import Channel, CompanionReading
 from threadpoolctl import threadpool_limits
 
 from tactomo.config import Endpoint
@@ -33,6 +33,7 @@ from tactomo.endpoint import is_local
 from tactomo.errors import CommandError, ConfigError
 from tactomo.protocols import NATIVE, check_scan_fits, emulator_of, find_protocol
 from tactomo.stream.commands import Nothing, explained
+from tactomo.twin.companions import SimulatedCompanions
 from tactomo.twin.control import (
     ControlSocket,
     GarbageArguments,
@@ -168,6 +169,7 @@ class Twin:
                 else None
             )
             undo.pop_all()
+        self._companions = SimulatedCompanions(config.description, config.seed)
         self._converter = self._make_converter()
         self._powered_s = time.monotonic()
         self._firmware = self._make_firmware(ports)
@@ -248,7 +250,7 @@ class Twin:
         """Start computing the voltages of the skin as it is at device time `time_s`."""
         if not self._surface.is_playing and any(p.line.is_open for p in self._firmware.ports):
             self._play_at(time_s)
-        presses = [indenter.press() for indenter in self._surface.presses_at(time_s).values()]
+        presses = self._presses_at(time_s)
         future: Future[Voltages]
         if self._drifting is None:
             future = self._solver.submit(self._skin.voltages, presses)
@@ -256,6 +258,16 @@ class Twin:
             future = self._solver.submit(self._drifting.voltages, presses, time_s)
         future.add_done_callback(lambda _: self._bell.ring())
         return future
+
+    def _presses_at(self, time_s: float) -> list[Press]:
+        return [indenter.press() for indenter in self._surface.presses_at(time_s).values()]
+
+    def _read_companions(self, time_s: float, counter: int) -> list[CompanionReading]:
+        """Return what companions read; only a simulated skin knows the force on it."""
+        if not isinstance(self._skin, SkinSimulator):
+            return []
+        forces_n = self._skin.forces_n(self._presses_at(time_s))
+        return self._companions.read(forces_n, time_s, counter)
 
     def _play_at(self, time_s: float) -> None:
         """Start the scripted scene; it may say how the skin drifts."""
@@ -273,7 +285,15 @@ class Twin:
             return ForeignFirmware(
                 emulator, identity, ports[0], self._sample, self._converter, self._clock
             )
-        return Firmware(identity, ports, self._sample, self._converter, config.rate_hz, self._clock)
+        return Firmware(
+            identity,
+            ports,
+            self._sample,
+            self._converter,
+            config.rate_hz,
+            self._clock,
+            self._read_companions,
+        )
 
     def _make_converter(self) -> Converter:
         unloaded = self._skin.voltages([])

@@ -24,6 +24,7 @@ from tactomo_protocol import (
     Channel,
     Command,
     CommandCode,
+    CompanionReading,
     Decoder,
     Hello,
     SampleFormat,
@@ -70,12 +71,14 @@ class Sample:
     counter: int
     time_s: float
     voltages: Future[Voltages]
+    readings: Sequence[CompanionReading]
 
 
 class Firmware:
     """The device behind its lines. For use by one thread.
 
-    `clock` has the seconds since power-up; at such a time `sample` starts computing voltages.
+    `clock` has the seconds since power-up; at such a time `sample` starts computing voltages, and
+    `read` has what the companions read then, at the scan of that counter.
     """
 
     def __init__(
@@ -86,6 +89,7 @@ class Firmware:
         converter: Converter,
         rate_hz: float,
         clock: Callable[[], float],
+        read: Callable[[float, int], Sequence[CompanionReading]] = lambda _, __: (),
     ) -> None:
         self.identity = identity
         self.ports = tuple(ports)
@@ -93,6 +97,7 @@ class Firmware:
         self.counter = 0
         self.late = 0
         self._sample = sample
+        self._read = read
         self._converter = converter
         self._clock = clock
         self._pending: Sample | None = None
@@ -145,7 +150,8 @@ class Firmware:
             return
         # The grid of instants is kept while the solves keep up with it; what was missed is missed.
         self._next_sample_s = max(self._next_sample_s + 1.0 / self.rate_hz, now_s)
-        self._pending = Sample(self.counter, now_s, self._sample(now_s))
+        readings = self._read(now_s, self.counter)
+        self._pending = Sample(self.counter, now_s, self._sample(now_s), readings)
         self.counter = (self.counter + 1) % 2**32
 
     def _finish_scan(self) -> None:
@@ -157,6 +163,10 @@ class Firmware:
         if self._clock() - sample.time_s > 1.0 / self.rate_hz:
             flags |= ScanFlag.LATE
             self.late += 1
+        leader = self.ports[0]
+        if leader.is_streaming:
+            for reading in sample.readings:
+                leader.line.send(encode(reading))
         for port in self.ports:
             for channel in port.channels:
                 if port.is_streaming and self._mute_until_s.get(channel, 0.0) <= self._clock():

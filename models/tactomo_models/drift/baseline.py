@@ -38,6 +38,7 @@ from tactomo_models.drift.channel_baseline import ChannelBaseline, Drift
 from tactomo_models.drift.drift_model import DriftSubspace
 from tactomo_models.drift.press_memory import PressMemory
 from tactomo_models.reconstruct import Reconstructor
+from tactomo_models.scans.companion_forces import CompanionReading
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scans.reference import Reference
@@ -121,6 +122,7 @@ class BaselineTracker:
         *,
         # channels whose device says that its converter clipped this scan
         saturated: Collection[Channel] = (),
+        companions: Collection[tuple[str, float] | CompanionReading] | None = None,
     ) -> Reconstruction:
         """Reconstruct one frame; before, the reference moves if need be.
 
@@ -129,10 +131,16 @@ class BaselineTracker:
         scans: Scans = {Channel.MAGNITUDE: magnitude, Channel.STRUCTURE: structure}
         if time_s - self._moved_s >= MOVE_S and any(c.has_moved for c in self._channels.values()):
             self._move(time_s)
-        measurement = self._reconstructor.compare(magnitude, structure, saturated=saturated)
+
+        def compare() -> Measurement:
+            return self._reconstructor.compare(
+                magnitude, structure, saturated=saturated, companions=companions
+            )
+
+        measurement = compare()
         if self._settles(time_s, measurement, scans):
             self._move(time_s)
-            measurement = self._reconstructor.compare(magnitude, structure, saturated=saturated)
+            measurement = compare()
         frame = self._reconstructor.solve(measurement)
         if self.reference is not None:
             self._take_note(time_s, measurement, frame, scans)

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
+import shapely
 
 from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.physics.bare_sheet import BareSheet, scan_voltages, volts_per_unit
@@ -37,6 +38,7 @@ from tactomo_models.physics.compiled_sheet import (
     Solution,
 )
 from tactomo_models.sensor.description import SensorDescription
+from tactomo_models.sensor.sheet import Ring
 
 _STRIP = 256  # spots at once: what that takes stays in the cache
 
@@ -255,6 +257,14 @@ class ForwardModel:
     def node_areas_m2(self) -> FloatArray:
         """(P,) share of the sheet's area that belongs to each pressable node."""
         return np.asarray(np.append(self._area, 0.0)[self._triangles_of].sum(axis=1) / 3)
+
+    def newtons_per_kpa(self, region_m: Ring | None = None) -> FloatArray:
+        """Newtons (P,) on a region, or on the whole sheet, of 1 kPa at each pressable node."""
+        of_each = 1e3 * self.node_areas_m2
+        if region_m is None:
+            return of_each
+        x, y = self.bare.points[:, self.bare.pressable]
+        return np.asarray(of_each * shapely.intersects_xy(shapely.Polygon(region_m), x, y))
 
     def probes(self, x_m: FloatArray, y_m: FloatArray, radius_m: float) -> Probes:
         """Prepare to look at the field around C points, each weighted by a cone of that radius."""

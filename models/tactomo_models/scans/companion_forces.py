@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from tactomo_protocol import Channel
@@ -13,6 +14,15 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.scans.changes import Changes
 
 DISPUTED = 4.0  # standard uncertainties apart: by chance once in 16,000 independent readings
+
+
+class CompanionReading(NamedTuple):
+    """What one companion says of a frame; name and value alone do as well."""
+
+    name: str
+    value: float  #: in its own unit; NaN where it has none
+    #: whether the sheets may have moved since it felt them: then it tells nothing of the frame
+    is_late: bool = False
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import Final, NamedTuple, Self
 
 import numpy as np
-import shapely
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
@@ -23,7 +22,7 @@ from tactomo_models.physics.artifact import MODEL_ERROR, Artifact, nominal_noise
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.robust import median, robust_sigma
 from tactomo_models.scans.changes import CORRELATED, WRONG_WAY, Changes, missing
-from tactomo_models.scans.companion_forces import CompanionForce
+from tactomo_models.scans.companion_forces import CompanionForce, CompanionReading
 from tactomo_models.scans.frame_noise import FrameNoiseEstimator, hides_press, noise_limit
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import (
@@ -69,17 +68,8 @@ class Sensor:
     @cached_property
     def companion_weights(self) -> dict[str, FloatArray]:
         """Newtons (P,) that each companion feels of one kPa at each pressable node."""
-        bare = self.forward.bare
-        x, y = bare.points[:, bare.pressable]
-        return {
-            name: 1e3
-            * self.forward.node_areas_m2
-            * (
-                companion.region_m is None
-                or shapely.intersects_xy(shapely.Polygon(companion.region_m), x, y)
-            )
-            for name, companion in self.description.companion.items()
-        }
+        companions = self.description.companion.items()
+        return {name: self.forward.newtons_per_kpa(one.region_m) for name, one in companions}
 
     @cached_property
     def structure_answers_more(self) -> bool:
@@ -345,7 +335,7 @@ class Tare:
         magnitude: FloatArray | None,
         structure: FloatArray | None,
         saturated: Collection[Channel] = (),
-        companions: Collection[tuple[str, float]] | None = None,
+        companions: Collection[tuple[str, float] | CompanionReading] | None = None,
     ) -> Measurement:
         """Relative changes of one frame's scans; see `Reconstructor.reconstruct`."""
         start_s = time.perf_counter()
@@ -375,26 +365,29 @@ class Tare:
             flags |= Flag.CHANNELS_SWAPPED
         standing_flags = flags & (LEFT_OUT & ~own_flags | Flag.CREEPING)
         stage_s = {"data": time.perf_counter() - start_s}
-        forces = self._forces(dict(companions or ()))
-        if companions is not None and forces.keys() != self.sensor.description.companion.keys():
+        readings = {each[0]: CompanionReading(*each) for each in companions or ()}
+        known = self.sensor.description.companion
+        usable = {k for k in known if k in readings and known[k].may_read(readings[k].value)}
+        if companions is not None and usable != known.keys():
             flags |= Flag.COMPANION_MISSING
+            faults += [f"companion {name} has no reading" for name in known if name not in usable]
+        forces = {
+            name: self._force(readings[name])
+            for name in known
+            if name in usable and not readings[name].is_late
+        }
         return Measurement(
             changes, flags, standing_flags, tuple(faults), stage_s, companions=forces
         )
 
-    def _forces(self, readings: Mapping[str, float]) -> dict[str, CompanionForce]:
-        """What the companions feel that have a reading within their limits."""
-        forces, at_rest = {}, dict(self.reference.companions or ())
-        for name, companion in self.sensor.description.companion.items():
-            reading = readings.get(name, np.nan)
-            least, most = companion.limits or (-np.inf, np.inf)
-            if not (np.isfinite(reading) and least <= reading <= most):
-                continue
-            offset = at_rest.get(name, companion.offset)
-            force_n = companion.gain_n_per_unit * (reading - offset)
-            sigma_n = float(np.hypot(companion.noise_n, companion.relative_error * force_n))
-            forces[name] = CompanionForce(force_n, sigma_n, self.sensor.companion_weights[name])
-        return forces
+    def _force(self, reading: CompanionReading) -> CompanionForce:
+        """What a companion feels since the tare."""
+        companion = self.sensor.description.companion[reading.name]
+        at_rest = dict(self.reference.companions or ())
+        offset = at_rest.get(reading.name, companion.offset)
+        force_n = companion.gain_n_per_unit * (reading.value - offset)
+        sigma_n = float(np.hypot(companion.noise_n, companion.relative_error * force_n))
+        return CompanionForce(force_n, sigma_n, self.sensor.companion_weights[reading.name])
 
     def _are_one(self, magnitude: FloatArray | None, structure: FloatArray | None) -> bool:
         """Tell whether both channels carry one sheet's scan: noise makes no two of them alike."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from tactomo_models.sensor.section import Section
@@ -13,15 +14,22 @@ from tactomo_models.sensor.sheet import Ring
 class Companion(Section):
     """A scalar that tells the force on the whole sheet, or on the part inside `region_m`.
 
+    The packets of a device name it by `index`; None stands for its place among the companions.
+
     The force in newtons is gain_n_per_unit * (reading - offset). The offset counts where the tare
-    has no readings of its own. A reading outside `limits` says that the device has clipped.
+    has no readings of its own. A reading outside `limits` says that the device has clipped. A
+    reading is of the force `dead_time_s` before it, behind a first-order lag of the time constant
+    `lag_s`.
     """
 
+    index: Annotated[int | None, Field(ge=0, le=255)] = None
     gain_n_per_unit: Annotated[float, Field(ge=-1e9, le=1e9)]
     offset: float = 0.0
     noise_n: Annotated[float, Field(gt=0, le=1e6)]
     relative_error: Annotated[float, Field(ge=0, le=1)] = 0.0
     limits: Annotated[tuple[float, float] | None, Field(strict=False)] = None
+    lag_s: Annotated[float, Field(ge=0, le=10)] = 0.0
+    dead_time_s: Annotated[float, Field(ge=0, le=10)] = 0.0
     region_m: Ring | None = None
 
     @model_validator(mode="after")
@@ -33,3 +41,8 @@ class Companion(Section):
                 f"limits = {list(self.limits)}: give the least reading, then the largest"
             )
         return self
+
+    def may_read(self, reading: float) -> bool:
+        """Whether a reading is a number within the limits."""
+        least, most = self.limits or (-np.inf, np.inf)
+        return bool(np.isfinite(reading) and least <= reading <= most)

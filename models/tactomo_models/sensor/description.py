@@ -144,6 +144,12 @@ class SensorDescription(Section):
                     f"pattern.{key} = {offset}: must be below the number of electrodes, "
                     f"{self.electrode_count}"
                 )
+        if len(self.companion_indices) < len(self.companion):
+            numbered = {k: v.index for k, v in self.companion.items() if v.index is not None}
+            raise ValueError(
+                f"companion: two share an index, {numbered or 'none'}: give each its own index, "
+                "by which the device's packets name it"
+            )
         self._check_listed_pairs()
         self._check_size()
         if self.mount is not None:
@@ -243,6 +249,14 @@ class SensorDescription(Section):
 
     def __hash__(self) -> int:
         return hash(self.sha256)
+
+    @cached_property
+    def companion_indices(self) -> dict[int, str]:
+        """The names of the companions by the index in the device's packets."""
+        return {
+            place if companion.index is None else companion.index: name
+            for place, (name, companion) in enumerate(self.companion.items())
+        }
 
     @cached_property
     def pairs(self) -> Pairs:

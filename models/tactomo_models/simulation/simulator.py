@@ -67,6 +67,17 @@ class SkinSimulator:
             self._last = (scene, {name: self._solve(name, scene) for name in self.channels})
         return self._last[1]
 
+    def forces_n(self, presses: Sequence[Press]) -> dict[str, float]:
+        """The force in newtons that each companion of the sensor feels."""
+        companions = self.description.companion.items()
+        if not companions:
+            return {}
+        pressure, coverage = strongest(presses, self._x, self._y, self.spacing_m)
+        return {
+            name: float(self.forward.newtons_per_kpa(one.region_m) @ (pressure * coverage))
+            for name, one in companions
+        }
+
     @property
     def channels(self) -> tuple[Channel, ...]:
         """The channels that the sensor has."""

@@ -13,12 +13,21 @@ import pytest
 from daemon_process import DaemonProcess
 from tactomo.config import load_config
 from tactomo.errors import ConfigError, RecordingError
-from tactomo.protocols import find_protocol, protocol_named, recognised, registry
+from tactomo.protocols import (
+    ForeignProtocol,
+    Reading,
+    find_protocol,
+    protocol_named,
+    recognised,
+    registry,
+)
 from tactomo.recordings.recording import Origin, open_recording
 from tactomo.twin import TwinConfig
 from tactomo_client import ControlError, request
 from tactomo_models import load_description
+from tactomo_protocol import CompanionReading, Scan, ScanFlag
 from typer.testing import CliRunner
+from variants import variant
 from waiting import wait_until
 
 SENSOR = load_description("matrix_disc")
@@ -177,3 +186,23 @@ def test_ports_knows_it_by_what_it_sends(folder: Path, board: str) -> None:
     assert recognised(b"..EIT\n..") is None
     result = CliRunner().invoke(app, ["ports", board, "--ask", "--protocol", "own_board:Floats"])
     assert "--protocol floats" in " ".join(result.output.split())
+
+
+class WithCell(ForeignProtocol):
+    """Whatever comes is a scan of ones, with a reading of a companion of that name."""
+
+    name, device_id = "with-cell", "with-cell"
+
+    def parse(self, data: bytes) -> Iterator[Reading]:
+        yield Reading(np.ones(SENSOR.measurements), 7, {data.decode(): 4.5})
+
+
+def test_a_reading_of_a_companion_comes_before_its_scan() -> None:
+    cell = {"index": 3, "gain_n_per_unit": 1.0, "noise_n": 1.0}
+    protocol = WithCell(variant(SENSOR, companion={"cell": cell}))
+    _, reading, scan = protocol.feed(b"cell")
+    assert reading == CompanionReading(3, ScanFlag(0), 7, 4.5)
+    assert isinstance(scan, Scan)
+    assert protocol.feed(b"pad") == []
+    assert protocol.trouble is not None
+    assert "no companion pad" in protocol.trouble.cause
