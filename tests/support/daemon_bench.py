@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 import zmq
 from mcap.reader import make_reader
+from tactomo.recordings.recording import open_recording
 from tactomo.service.daemon import Daemon
 from tactomo_client import Keys, request
 from tactomo_client.keys import secure
-from tactomo_client.messages import KINDS, Message, decode_message, topic
+from tactomo_client.messages import KINDS, Message, array_from_wire, decode_message, topic
 from tactomo_models import Contact, Flag, Reconstruction, Reference
 from tactomo_models.arrays import FloatArray, Image
 from tactomo_models.scans.companion_forces import CompanionReading
@@ -337,3 +338,19 @@ class Heard:
 
     def of(self, kind: str) -> list[dict[str, Any]]:
         return [message.fields for message in self._messages if message.kind == kind]
+
+
+def maps_of(frames: list[dict[str, Any]]) -> dict[int, Any]:
+    """The map of each frame by the counter of its scans; None where it has none."""
+    return {f["scan_counter"]: f["map"] and array_from_wire(f["map"]) for f in frames}
+
+
+def scan_counters(path: Path, channel: Channel = Channel.MAGNITUDE) -> list[int]:
+    """The counters of a channel's scans in a recording, as its ports said them."""
+    recording = open_recording(path)
+    found: list[Packet] = []
+    for port in range(len(recording.origin.ports)):
+        decoder = Decoder()
+        for chunk in recording.chunks(port):
+            found += decoder.feed(chunk.data)
+    return [p.counter for p in found if isinstance(p, Scan) and p.channel == channel]

@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from daemon_bench import scan_counters
 from tactomo.recordings import active_recording, recorder
 from tactomo.recordings.recording import open_recording
 from tactomo.recordings.recovery import recover
 from tactomo_client import ControlError, request
-from tactomo_protocol import Channel, Decoder, Scan
 from waiting import wait_until
 
 Start = Callable[..., Any]
@@ -71,12 +71,6 @@ def stuck_disk(ext4_disk: Path) -> Iterator[tuple[Path, Callable[[str], None]]]:
 
     yield ext4_disk, turn
     subprocess.run(["fsfreeze", "-u", str(ext4_disk)], check=False, capture_output=True)
-
-
-def counters(path: Path) -> list[int]:
-    decoder = Decoder()
-    packets = [p for chunk in open_recording(path).chunks(0) for p in decoder.feed(chunk.data)]
-    return [p.counter for p in packets if isinstance(p, Scan) and p.channel == Channel.MAGNITUDE]
 
 
 def fill(disk: Path, leave_bytes: int) -> Path:
@@ -152,11 +146,11 @@ def test_a_recording_to_one_file_ends_with_the_room_and_can_be_recovered(
     told_by_status = b.ask("status")
     assert told_by_status["recorder"]["waits_for"] is None
     assert any("No space" in issue["what"] for issue in told_by_status["issues"])
-    found = counters(path)
+    found = scan_counters(path)
     assert found == list(range(first, first + len(found)))
     assert len(found) > 5
     again = recover(path, tmp_path / "again.mcap").path
-    assert counters(again) == found
+    assert scan_counters(again) == found
     with pytest.raises(Exception, match="MB are free"):
         b.ask("record_start", path="two.mcap")
 
@@ -183,7 +177,7 @@ def test_a_stuck_disk_holds_up_nothing_and_costs_nothing(
     turn("-u")
     step_until(b, lambda: told(b, "recording_resumed"))
     b.ask("record_stop")
-    assert counters(path) == list(range(1, b.skin.counter + 1))
+    assert scan_counters(path) == list(range(1, b.skin.counter + 1))
 
 
 @pytest.mark.slow
@@ -207,8 +201,8 @@ def test_a_disk_that_stays_stuck_ends_the_recording_when_enough_waits(
     b.step()
     b.ask("record_stop")
     first, second = sorted((disk / "set").iterdir())
-    assert counters(first) == list(range(1, 1 + len(counters(first))))
-    assert len(counters(first)) > 60  # 200 kB of them
+    assert scan_counters(first) == list(range(1, 1 + len(scan_counters(first))))
+    assert len(scan_counters(first)) > 60  # 200 kB of them
     assert open_recording(first).summary.is_complete
     assert open_recording(second).summary.frames > 0
     assert len(told(b, "recording_failed")) == 1
@@ -232,7 +226,7 @@ def test_the_daemon_stops_although_the_disk_does_not_answer(
     assert time.monotonic() - begin_s < recorder.STOP_S + 10
     turn("-u")
     b.until(lambda: all(thread.name != "recorder" for thread in threading.enumerate()))
-    assert counters(disk / "a.mcap") == [1, 2, 3, 4]
+    assert scan_counters(disk / "a.mcap") == [1, 2, 3, 4]
 
 
 def test_a_disk_that_dies(bench: Start, ext4_disk: Path, tmp_path: Path) -> None:
@@ -269,7 +263,7 @@ def test_what_comes_while_the_disk_is_asked_to_keep_it_is_written(
     b.step()
     assert asked.wait(60)
     b.step()
-    b.until(lambda: b.skin.counter in counters(path))
+    b.until(lambda: b.skin.counter in scan_counters(path))
     answered.set()
     b.ask("record_stop")
     assert open_recording(path).summary.is_complete
@@ -320,7 +314,7 @@ def test_a_folder_that_takes_no_new_file_leaves_the_present_one_going(
     b.step()
     last = b.skin.counter
     b.daemon.stop()
-    found = {counter for path in folder.iterdir() for counter in counters(path)}
+    found = {counter for path in folder.iterdir() for counter in scan_counters(path)}
     assert found == set(range(1, last + 1))
 
 

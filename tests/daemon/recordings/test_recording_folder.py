@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from daemon_bench import maps_of, scan_counters
 from tactomo.config import RecordingConfig
 from tactomo.errors import RecordingError
 from tactomo.recordings import recorder
@@ -17,26 +18,10 @@ from tactomo.recordings.recording import Origin, open_recording
 from tactomo.recordings.recording_set import open_replayable
 from tactomo.recordings.recording_writer import RecordingWriter
 from tactomo.recordings.rotation import KeptRecording, list_recordings, to_delete
-from tactomo_client.messages import array_from_wire
 from tactomo_protocol import Channel, Decoder, Scan
 
 Start = Callable[..., Any]
 DAY_S = 86_400.0
-
-
-def maps(frames: list[dict[str, Any]]) -> dict[int, Any]:
-    return {f["scan_counter"]: f["map"] and array_from_wire(f["map"]) for f in frames}
-
-
-def counters(path: Path, channel: Channel) -> list[int]:
-    """The counters of a channel's scans in a recording, as its ports said them."""
-    recording = open_recording(path)
-    found = []
-    for port in range(len(recording.origin.ports)):
-        decoder = Decoder()
-        for chunk in recording.chunks(port):
-            found += [p for p in decoder.feed(chunk.data) if isinstance(p, Scan)]
-    return [scan.counter for scan in found if scan.channel == channel]
 
 
 @pytest.mark.slow
@@ -59,7 +44,7 @@ def test_each_file_replays_alone_and_together_they_have_every_frame_once(
     last = b.skin.counter
     b.daemon.stop()
     rotated = b.daemon.status()["events"]["counts"]["recording_rotated"]  # the last one unheard
-    live = maps(b.listener.of("map"))
+    live = maps_of(b.listener.of("map"))
     files = sorted(folder.iterdir())
     numbers = [path.name.split("-")[1] for path in files]
     assert numbers == [f"{number:06d}" for number in range(1, len(files) + 1)]
@@ -69,22 +54,22 @@ def test_each_file_replays_alone_and_together_they_have_every_frame_once(
         assert summary.is_complete
         assert summary.corrupt == 0
         assert summary.hellos or not summary.port_bytes  # begun just before the end
-        replayed = maps(replay(path).of("map"))
+        replayed = maps_of(replay(path).of("map"))
         assert len(replayed) == summary.frames
         for counter, image in replayed.items():
             np.testing.assert_array_equal(image, live[counter], err_msg=f"{path} {counter}")
         again += replayed
     assert again == list(live) == list(range(1, last + 1))
     whole = replay(folder).of("map")
-    assert maps(whole).keys() == live.keys()
-    for counter, image in maps(whole).items():
+    assert maps_of(whole).keys() == live.keys()
+    for counter, image in maps_of(whole).items():
         np.testing.assert_array_equal(image, live[counter], err_msg=f"{folder} {counter}")
     identities = {f["scan_counter"]: [c["id"] for c in f["contacts"]] for f in whole}
     assert identities == {
         f["scan_counter"]: [c["id"] for c in f["contacts"]] for f in b.listener.of("map")
     }
     for channel in Channel:
-        assert {c for path in files for c in counters(path, channel)} == set(again)
+        assert {c for path in files for c in scan_counters(path, channel)} == set(again)
     assert rotated == len(files) - 1 >= 3
 
 

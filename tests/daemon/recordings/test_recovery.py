@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from daemon_bench import scan_counters
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -29,7 +30,7 @@ from tactomo.scans import Mark, ScanKey
 from tactomo_client.messages import array_from_wire
 from tactomo_client.recording_file import intact_chunks
 from tactomo_models import Reference
-from tactomo_protocol import Channel, Decoder, Hello, SampleFormat, Scan, ScanFlag, encode
+from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag, encode
 
 Start = Callable[..., Any]
 Run = Callable[..., Any]
@@ -99,13 +100,6 @@ def chunks() -> list[tuple[int, int]]:
     return [(chunk.start, chunk.end) for chunk in intact_chunks(io.BytesIO(whole()))]
 
 
-def counters(path: Path) -> list[int]:
-    """Counters of the magnitude channel's scans in a recording."""
-    decoder = Decoder()
-    packets = [p for chunk in open_recording(path).chunks(0) for p in decoder.feed(chunk.data)]
-    return [p.counter for p in packets if isinstance(p, Scan) and p.channel == Channel.MAGNITUDE]
-
-
 def messages(path: Path) -> list[tuple[str, bytes, int, int]]:
     with path.open("rb") as file:
         return [
@@ -141,7 +135,7 @@ def assert_honest(folder: Path, data: bytes) -> None:
             recovered(folder, data)
         return
     recovery, output = recovered(folder, data)
-    kept = counters(output)
+    kept = scan_counters(output)
     assert set(want) <= set(kept)  # more where the damage is to a chunk's times alone
     assert kept == sorted(set(kept))
     want = kept
@@ -173,7 +167,7 @@ def test_a_whole_recording_is_copied(tmp_path: Path) -> None:
     recovery, output = recovered(tmp_path, whole())
     assert recovery.is_intact
     assert recovery.lost_bytes == 0
-    assert counters(output) == list(range(SCANS))
+    assert scan_counters(output) == list(range(SCANS))
     assert open_recording(output).origin == ORIGIN
     assert messages(output) == messages(tmp_path / "damaged.mcap")
 
@@ -226,7 +220,7 @@ def test_reading_what_is_damaged_gives_what_is_before_the_damage_or_an_error(
     (tmp_path / "a.mcap").write_bytes(data[: length % (2 * len(data))])
     try:
         recording = open_recording(tmp_path / "a.mcap")
-        summary, marks, found = recording.summary, recording.marks(), counters(recording.path)
+        summary, marks, found = recording.summary, recording.marks(), scan_counters(recording.path)
         span = recording.span
     except RecordingError:
         return
@@ -247,7 +241,7 @@ def test_a_part_missing(tmp_path: Path, cut: int, length: int) -> None:
     ]
     want = [index * A_CHUNK + k for index in kept for k in range(A_CHUNK)]
     _, output = recovered(tmp_path, damaged)
-    found = counters(output)
+    found = scan_counters(output)
     assert set(want) <= set(found)  # more where only a chunk's times went
     assert found == sorted(set(found))
 
@@ -262,7 +256,7 @@ def test_a_tail_of_zeros_as_after_a_loss_of_power(tmp_path: Path, zeros: int) ->
     assert not summary.has_more
     (tmp_path / "zeros.mcap").unlink()
     recovery, output = recovered(tmp_path, data)
-    assert counters(output) == list(range(8 * A_CHUNK))
+    assert scan_counters(output) == list(range(8 * A_CHUNK))
     assert recovery.is_cut
     assert not recovery.gaps
 
@@ -297,7 +291,7 @@ def test_after_a_gap_marks_begin_cold_and_wait_for_their_reference(tmp_path: Pat
 def test_a_recording_that_has_lost_its_beginning(tmp_path: Path, length: int) -> None:
     data = bytes(length) + whole()[length:]
     recovery, output = recovered(tmp_path, data)
-    assert counters(output) == expected(data)
+    assert scan_counters(output) == expected(data)
     assert open_recording(output).origin.ports
     if length == 400:
         assert not recovery.knows_origin
@@ -308,7 +302,7 @@ def test_any_byte_of_the_beginning_may_be_another(tmp_path: Path) -> None:
         data = bytearray(whole())
         data[position] ^= 0xFF
         _, output = recovered(tmp_path, bytes(data))
-        assert counters(output) == list(range(SCANS)), position
+        assert scan_counters(output) == list(range(SCANS)), position
 
 
 def test_the_first_chunk_lost_is_no_loss_of_the_names_of_the_rest(tmp_path: Path) -> None:

@@ -124,7 +124,7 @@ def test_a_site_that_is_not_there_is_told() -> None:
         MujocoSkin(model, "palm")
 
 
-class Pressing(gymnasium.Env[Any, Any]):  # type: ignore[misc,name-defined]
+class Pressing(gymnasium.Env[Any, Any]):
     """A ball that is pressed on the plate by so many newtons: the action."""
 
     def __init__(self) -> None:
