@@ -13,7 +13,7 @@ same step says what is left to gain.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -40,7 +40,8 @@ class Foreseen:
     log_ratio: float
     gain: float  # what the last step takes off the cost
     own: IntArray  # (m,) which were asked about
-    every_sigma: FloatArray  # (K, COLUMNS) standard uncertainties; 0 of what is not fitted
+    family: PressureField = field(repr=False)
+    information: FloatArray = field(repr=False)  # (N + 1, N + 1) inverse covariance
 
     @property
     def contacts(self) -> FloatArray:
@@ -49,33 +50,33 @@ class Foreseen:
 
     @property
     def sigmas(self) -> FloatArray:
-        """(m, COLUMNS) their standard uncertainties."""
-        return np.asarray(self.every_sigma[self.own])
+        """(m, COLUMNS) their standard uncertainties; 0 of what is not fitted."""
+        sigmas = np.zeros(self.family.free.shape)
+        sigmas[self.family.free] = np.sqrt(np.diag(np.linalg.inv(self.information))[:-1])
+        return np.asarray(sigmas[self.own])
 
 
 def foreseen(
     fit: FieldFit,
-    field: PressureField,
+    bare: PressureField,
     account: Account,
-    k: int,
-    kinds: Sequence[Kind],
+    asks: Sequence[tuple[int, Kind]],
     frame: Frame,
 ) -> list[Foreseen]:
-    """What a fit would come to with one contact of another kind, for each such kind.
+    """What a fit would come to with one contact of another kind, for each contact and kind asked.
 
     Args:
         fit: what fits fields to the sheets.
-        field: a field without contacts.
+        bare: a field without contacts.
         account: the field, at its minimum.
-        k: the contact.
-        kinds: what it may be instead.
+        asks: contacts, and what each may be instead.
         frame: the data.
     """
-    begun = [_Begun.of(fit, field, account, k, kind, frame) for kind in kinds]
+    begun = [_Begun.of(fit, bare, account, k, kind, frame) for k, kind in asks]
     steps = fit.steps_to(account.fitted, [each.drawing for each in begun], frame.measured)
     return [
         _of_kind(fit, account, k, each, step, frame)
-        for each, step in zip(begun, steps, strict=True)
+        for (k, _), each, step in zip(asks, begun, steps, strict=True)
     ]
 
 
@@ -197,10 +198,8 @@ def _end(fit: FieldFit, at: _At, frame: Frame, own: IntArray) -> Foreseen:
     found, _ = laplace(likelihood, family, parameters, J, chi_squared, precision, offset + step)
     # A peak just above the onset is as uncertain as the sheet tells there, not as before any data.
     information = likelihood.information(J, chi_squared) + np.diag(precision)
-    sigmas = np.zeros(family.free.shape)
-    sigmas[family.free] = np.sqrt(np.diag(np.linalg.inv(information))[:-1])
     log_ratio = at.log_ratio + float(step[-1])
-    return Foreseen(found, family.split(parameters), log_ratio, gain, own, sigmas)
+    return Foreseen(found, family.split(parameters), log_ratio, gain, own, family, information)
 
 
 def _newton(fit: FieldFit, at: _At, normal: FloatArray, gradient: FloatArray) -> FloatArray:

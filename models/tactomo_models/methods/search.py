@@ -27,10 +27,11 @@ from tactomo_models.methods.foreseen import Foreseen, at_end, foreseen, with_kin
 from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
 from tactomo_models.methods.rivals import (
     Rivals,
+    as_foreseen,
+    as_solved,
     choices,
     in_another_frame,
     opened,
-    rival_of,
     to_be_asked,
     turned,
     unasked,
@@ -56,11 +57,6 @@ FEW_STEPS = 4  # of starts that are compared: a start's cost says little before
 # far to go.
 STEPS, FAR_STEPS = 4, 20
 HOPELESS = -6.0  # logarithm of odds: what is foreseen below is asked no more
-# Logarithm of odds: what is foreseen above is solved for, since the place of a contact turns on it.
-# Of 150 rivals of mixed presses, what was foreseen was right to 0.3 (median; 1.3 for 95 %). With -2
-# one scene of a ring and a disc loses 0.004 of its correlation, with -1 maps at 20 dB 0.002; with
-# -6, a cold frame has more solves and the same maps.
-DOUBTFUL = -4.0
 SURE_STEPS = 6  # of a fit of two contacts from afar, before what it foresees is believed
 # Of chi-squared: what the Jacobian foresees of a last step is taken for true, without a solve.
 FORESEEN = 0.5
@@ -68,22 +64,6 @@ FORESEEN = 0.5
 SURPRISE = 2.0
 ROUNDS = 4  # of questions, each after what the last one changed
 ANOTHER_PRESS = np.log(1.25)  # change of a peak, from which evidence of a kind is of another press
-
-
-@dataclass(frozen=True)
-class Pass:
-    """What all contacts are asked, before anything is decided."""
-
-    kinds: frozenset[Kind]
-    least: float  # log odds from which a rival takes a contact's place
-
-
-# First what a peak depends on most, by half: where it makes a contact hopeless, that need be asked
-# for nothing else.
-PASSES = (
-    Pass(frozenset({Kind.EVEN, Kind.FALLING}), -HOPELESS),
-    Pass(frozenset(Kind), LIKELIER),
-)
 
 
 @dataclass(frozen=True)
@@ -241,7 +221,7 @@ class Search:
             return belief
         rivals = tuple(
             {
-                kind: replace(rival, is_open=due and rival.log_odds > HOPELESS)
+                kind: replace(rival, is_open=rival.is_open or (due and rival.log_odds > HOPELESS))
                 for kind, rival in mine.items()
                 if is_same
             }
@@ -395,18 +375,17 @@ class Search:
             return self._without_specks(belief, specks, frame)
         if not belief.is_parted and _is_light(account):
             return self._joined(belief, frame)
-        for each in PASSES if belief.rounds < ROUNDS else ():
-            for k, mine in enumerate(belief.rivals):
-                kinds = [
-                    kind
-                    for kind in self._kinds(account, k, frame)
-                    if kind in each.kinds and to_be_asked(kind, mine)
-                ]
-                if kinds:
-                    return self._asked(belief, k, kinds, frame)
-            better = self._decided(belief, each, frame)
+        if belief.rounds < ROUNDS:
+            asks = self._unasked(belief, frame)
+            if asks:
+                return self._asked(belief, asks, frame)
+            better = self._decided(belief, frame)
             if better is not None:
                 return better
+            for k in range(account.family.count):
+                kinds = self._unsolved(belief, k, frame)
+                if kinds:
+                    return self._solved(belief, k, kinds, frame)
         if not belief.lacks_none:
             born = self._with_missing(account, frame, far=False)
             if born is not account:
@@ -443,37 +422,64 @@ class Search:
             kinds.append(Kind.TWO)
         return [kind for kind in kinds if kind is not own]
 
-    def _asked(self, belief: Belief, k: int, kinds: list[Kind], frame: Frame) -> Belief:
-        """Ask a contact whether it is of other kinds."""
-        account = belief.account
-        mine, now = dict(belief.rivals[k]), at_end(self.fit, account, frame)
-        # Of two contacts in place of one that explains little the Jacobian foresees nothing.
-        explains_little = account.chi_squared > SURPRISE * frame.likelihood.count
-        from_start = [kind for kind in kinds if kind is Kind.TWO and explains_little]
-        ahead = [kind for kind in kinds if kind not in from_start]
-        found = dict(
-            zip(ahead, foreseen(self.fit, self.field, account, k, ahead, frame), strict=True)
-        )
-        for kind, each in found.items():
-            frame.budget.spend(account.fitted)  # about what asking takes, beside solves
-            if each.log_evidence > now.log_evidence + DOUBTFUL:
-                start = self._account(each.every, each.log_ratio, frame)
-                found[kind] = self._checked(start, each.own, now, frame)
-        for kind in from_start:
-            every, own = with_kind(self.fit, self.field, account, k, kind)
-            start = self._account(every, account.fitted.log_ratio, frame)
-            found[kind] = self._checked(start, own, now, frame, FAR_STEPS, SURE_STEPS)
-        for kind, each in found.items():
-            log_odds = each.log_evidence - now.log_evidence
-            mine[kind] = rival_of(each, log_odds, account.contacts[k], mine.get(kind))
-        rivals = (*belief.rivals[:k], mine, *belief.rivals[k + 1 :])
-        return replace(belief, rivals=rivals)
+    def _unasked(self, belief: Belief, frame: Frame) -> list[tuple[int, Kind]]:
+        """Contacts and kinds that are still to be asked, of which the Jacobian foresees anything.
+
+        Of two contacts in place of one that explains little it foresees nothing.
+        """
+        is_far = self._explains_little(belief.account, frame)
+        return [
+            (k, kind)
+            for k, mine in enumerate(belief.rivals)
+            for kind in self._kinds(belief.account, k, frame)
+            if to_be_asked(kind, mine) and not (is_far and kind is Kind.TWO)
+        ]
+
+    def _asked(self, belief: Belief, asks: list[tuple[int, Kind]], frame: Frame) -> Belief:
+        """Foresee what contacts would come to be of other kinds."""
+        account, rivals = belief.account, [dict(mine) for mine in belief.rivals]
+        now = at_end(self.fit, account, frame).log_evidence
+        found = foreseen(self.fit, self.field, account, asks, frame)
+        for (k, kind), each in zip(asks, found, strict=True):
+            before, log_odds = rivals[k].get(kind), each.log_evidence - now
+            rivals[k][kind] = as_foreseen(each, log_odds, account.contacts[k], before)
+        for _ in {k for k, _ in asks}:
+            frame.budget.spend(account.fitted)  # about what asking a contact takes
+        return replace(belief, rivals=tuple(rivals))
+
+    def _unsolved(self, belief: Belief, k: int, frame: Frame) -> list[Kind]:
+        """Kinds that a contact is still to be solved for."""
+        mine = belief.rivals[k]
+        kinds = [kind for kind, rival in mine.items() if rival.is_doubtful]
+        if self._explains_little(belief.account, frame) and to_be_asked(Kind.TWO, mine):
+            kinds += [kind for kind in self._kinds(belief.account, k, frame) if kind is Kind.TWO]
+        return kinds
+
+    def _solved(self, belief: Belief, k: int, kinds: list[Kind], frame: Frame) -> Belief:
+        """Solve for a contact of other kinds."""
+        account, mine = belief.account, dict(belief.rivals[k])
+        now = at_end(self.fit, account, frame).log_evidence
+        for kind in kinds:
+            rival = mine.get(kind)
+            if rival is None or rival.found is None:
+                every, own = with_kind(self.fit, self.field, account, k, kind)
+                start = self._account(every, account.fitted.log_ratio, frame)
+                each = self._checked(start, own, now, frame, FAR_STEPS, SURE_STEPS)
+            else:
+                start = self._account(rival.found.every, rival.found.log_ratio, frame)
+                each = self._checked(start, rival.found.own, now, frame)
+            mine[kind] = as_solved(each, each.log_evidence - now, account.contacts[k], rival)
+        return self._with_rivals(belief, k, mine)
+
+    @staticmethod
+    def _explains_little(account: Account, frame: Frame) -> bool:
+        return account.chi_squared > SURPRISE * frame.likelihood.count
 
     def _checked(
         self,
         solved: Account,  # where to begin
         own: IntArray,  # (m,) the contacts that were asked about
-        now: Foreseen,  # the end of the field as it is
+        now: float,  # the log evidence of the field as it is
         frame: Frame,
         steps: int = STEPS,  # no more than these
         sure: int = 0,  # of them before what is foreseen to be hopeless is believed
@@ -481,7 +487,7 @@ class Search:
         """What other contacts come to, by a fit that ends early where that is hopeless."""
         found = at_end(self.fit, solved, frame, own)
         for taken in range(steps):
-            is_hopeless = found.log_evidence - now.log_evidence < HOPELESS
+            is_hopeless = found.log_evidence - now < HOPELESS
             # A step that would lose is cut at a limit: the end is still far.
             if 0 <= found.gain * solved.unit < FORESEEN or (is_hopeless and taken >= sure):
                 break
@@ -489,28 +495,32 @@ class Search:
             found = at_end(self.fit, solved, frame, own)
         return found
 
-    def _decided(self, belief: Belief, asked: Pass, frame: Frame) -> Belief | None:
+    def _decided(self, belief: Belief, frame: Frame) -> Belief | None:
         """The belief with each contact of its likeliest kind, where that is likelier altogether."""
-        log_evidence = belief.account.log_evidence
-        born = self._missed(belief, frame) if asked is PASSES[-1] else None
-        better = [born] if born else []
-        refused: dict[int, tuple[Kind, float]] = {}  # by the fit of all, and its log odds
-        for choice in choices(belief.rivals, asked.least):
+        account = belief.account
+        for choice in choices(belief.rivals, LIKELIER):
             changed = self._changed(belief, choice, frame)
-            gain = changed.account.log_evidence - log_evidence
-            if gain > 0:
-                better.append(changed)
-                break
-            if len(choice) == 1:
-                refused = {k: (kind, gain) for k, kind in choice.items()}
-        if better:
-            return max(better, key=lambda one: one.account.log_evidence)
-        if not refused:
-            return None
-        rivals = [dict(mine) for mine in belief.rivals]
-        for k, (kind, gain) in refused.items():
-            rivals[k][kind] = replace(rivals[k][kind], log_odds=gain)
-        return replace(belief, rivals=tuple(rivals))
+            log_odds = changed.account.log_evidence - account.log_evidence
+            (k, kind), *more = choice.items()
+            rival = belief.rivals[k][kind]
+            if not more:
+                log_odds = rival.mean(log_odds)
+            if log_odds >= LIKELIER:
+                explained = frame.likelihood.explains(changed.account.chi_squared)
+                born = None if explained else self._missed(belief, frame)
+                others = [born] if born else []
+                return max([changed, *others], key=lambda one: one.account.log_evidence)
+            if not more:
+                if rival.is_one:
+                    difference = changed.account.contacts[k] - account.contacts[k]
+                    rival = replace(rival, difference=difference)
+                mine = {**belief.rivals[k], kind: replace(rival, log_odds=log_odds, is_solved=True)}
+                return self._with_rivals(belief, k, mine)
+        return None
+
+    @staticmethod
+    def _with_rivals(belief: Belief, k: int, mine: Rivals) -> Belief:
+        return replace(belief, rivals=(*belief.rivals[:k], mine, *belief.rivals[k + 1 :]))
 
     def _missed(self, belief: Belief, frame: Frame) -> Belief | None:
         """The belief with a contact more, where that is likelier than data left unexplained."""
@@ -523,30 +533,38 @@ class Search:
     def _changed(self, belief: Belief, choice: Mapping[int, Kind], frame: Frame) -> Belief:
         """The belief with some contacts of another kind, fitted altogether."""
         account = belief.account
-        rows, rivals = [], []
-        for k, contact in enumerate(account.contacts):
-            mine = belief.rivals[k]
-            if k not in choice:
-                rows.append(contact[None])
-                rivals.append(mine)
-                continue
-            kind = choice[k]
-            won = mine[kind]
-            start = (contact + won.difference)[None] if won.is_one else won.difference
-            rows.append(start)
-            if won.is_one:
-                rivals.append(turned(mine, kind, kind_of(contact), account.sigmas[k]))
-            else:
-                rivals += [{}] * len(start)
+        rows = [contact[None] for contact in account.contacts]
+        for k, kind in choice.items():
+            won = belief.rivals[k][kind]
+            rows[k] = (rows[k][0] + won.difference)[None] if won.is_one else won.difference
         every, log_ratio = np.vstack(rows), account.fitted.log_ratio
-        alone = [belief.rivals[k][kind].found for k, kind in choice.items()]
-        if len(alone) == 1 and alone[0] is not None:
-            every, log_ratio = alone[0].every, alone[0].log_ratio
+        ends = [belief.rivals[k][kind].found for k, kind in choice.items()]
+        if len(ends) == 1 and ends[0] is not None:
+            every, log_ratio = ends[0].every, ends[0].log_ratio
         start = self._account(every, log_ratio, frame)
         changed = self._descended(start, frame, self._steps(account, frame))
         gain = changed.log_evidence - account.log_evidence
-        if belief.rounds + 1 < ROUNDS:  # else nobody is asked again
-            rivals = [opened(mine, gain) for mine in rivals]
+        at = np.cumsum([0, *map(len, rows)])
+        rivals: list[Rivals] = []
+        for k, mine in enumerate(belief.rivals):
+            if belief.rounds + 1 < ROUNDS:  # else nobody is asked again
+                mine = opened(mine, gain)
+            if k not in choice:
+                rivals.append(mine)
+            elif (won := belief.rivals[k][choice[k]]).is_one:
+                alone = len(choice) == 1
+                mine = turned(
+                    mine,
+                    choice[k],
+                    account.contacts[k],
+                    changed.contacts[at[k]],
+                    account.sigmas[k],
+                    won.mean(gain) if alone else won.log_odds,
+                    alone or won.is_solved,
+                )
+                rivals.append(mine)
+            else:
+                rivals += [{}] * len(rows[k])
         return replace(
             belief,
             account=changed,
