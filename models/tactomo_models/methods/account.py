@@ -149,7 +149,7 @@ def descended(
 ) -> Account:
     """An account nearer to its minimum, by Levenberg-Marquardt on all sheets at once.
 
-    It is there when no more than `NEGLIGIBLE` is left to gain, as its own Jacobian foresees that.
+    It is there when no more than `NEGLIGIBLE` is left to gain, as its own Jacobian predicts that.
     What was begun is finished: a budget is looked at between fits, never within one.
     """
     for _ in range(steps):
@@ -158,7 +158,7 @@ def descended(
         if holds_ratio:
             normal[-1], normal[:, -1], gradient[-1] = 0.0, 0.0, 0.0
             normal[-1, -1] = 1.0
-        if foreseen(normal, gradient) * account.unit < NEGLIGIBLE:
+        if predicted_gain(normal, gradient) * account.unit < NEGLIGIBLE:
             return replace(account, at_minimum=True)
         better = _stepped(fit, account, normal, gradient, frame)
         if better is None:
@@ -214,6 +214,6 @@ def damped_steps(
         damping *= 5
 
 
-def foreseen(normal: FloatArray, gradient: FloatArray) -> float:
+def predicted_gain(normal: FloatArray, gradient: FloatArray) -> float:
     """What further steps would gain in cost: no solve."""
     return float(gradient @ np.linalg.solve(normal, gradient))

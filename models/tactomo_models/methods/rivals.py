@@ -1,7 +1,7 @@
 """Rivals: what else a contact may be than what it is taken for, and by what odds.
 
 A rival is kept as its difference from the contact, so that it moves on with it. Odds are of the
-evidence of both (`foreseen`); what nobody has asked yet is as likely as before any data.
+evidence of both (`prediction`); what nobody has asked yet is as likely as before any data.
 """
 
 from __future__ import annotations
@@ -10,18 +10,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from tactomo_models.arrays import FloatArray
-from tactomo_models.methods.foreseen import Foreseen
 from tactomo_models.methods.kinds import SHARES, Kind, as_kind, kind_of
+from tactomo_models.methods.prediction import Prediction
 from tactomo_models.scene.field_account import Alternative
 
-OPEN = -3.0  # logarithm of odds: a rival above is asked again once others have become another kind
-# Logarithm of odds: what is foreseen above is solved for, since the place of a contact turns on it.
-# Of 150 rivals of mixed presses, what was foreseen was right to 0.3 (median; 1.3 for 95 %). With -2
-# one scene of a ring and a disc loses 0.004 of its correlation, with -1 maps at 20 dB 0.002; with
-# -6, a cold frame has more solves and the same maps.
+OPEN = -3.0  # log odds: a rival above is asked again once others have become another kind
+# Log odds: a rival that is predicted above is solved for, since the place of a contact turns on it.
+# Of 150 rivals of mixed presses, predictions were right to 0.3 (median; 1.3 for 95 %). With -2 one
+# scene of a ring and a disc loses 0.004 of its correlation, with -1 maps at 20 dB 0.002; with -6, a
+# cold frame has more solves and the same maps.
 DOUBTFUL = -4.0
-# Change of a logarithm of odds below which a rival stays as it was solved for: what is foreseen
-# differs from that by as much (median).
+# Change of the predicted log odds below which a rival stays as it was solved for: a prediction errs
+# by as much (median).
 SAME = 0.3
 
 
@@ -34,10 +34,10 @@ class Rival:
     difference: FloatArray
     sigmas: FloatArray  # (COLUMNS,) their standard uncertainties
     is_open: bool = False  # whether it is to be asked once more
-    is_solved: bool = False  # whether the odds are of solved fields, not foreseen
-    foretold: float | None = None  # log odds that were foreseen when it was asked last
+    is_solved: bool = False  # whether the odds are of solved fields, not predicted
+    predicted: float | None = None  # predicted log odds when it was asked last
     before: float | None = None  # log odds in other frames
-    found: Foreseen | None = None  # where it was asked last, all contacts moved with it
+    found: Prediction | None = None  # where it was asked last, all contacts moved with it
 
     @property
     def is_one(self) -> bool:
@@ -91,25 +91,29 @@ def to_be_asked(kind: Kind, rivals: Rivals) -> bool:
     return kind not in rivals or rivals[kind].is_open
 
 
-def as_foreseen(
-    found: Foreseen, log_odds: float, contact: FloatArray, before: Rival | None
+def as_predicted(
+    found: Prediction, log_odds: float, contact: FloatArray, before: Rival | None
 ) -> Rival:
-    """A rival as it is foreseen; as it was solved for, where that was foreseen alike."""
+    """A rival as it is predicted; as it was solved for, where the prediction is about the same."""
     if before is not None and before.is_solved:
-        foretold = log_odds if before.foretold is None else before.foretold
-        if abs(log_odds - foretold) < SAME:
-            return replace(before, is_open=False, foretold=foretold, found=found)
+        predicted = log_odds if before.predicted is None else before.predicted
+        if abs(log_odds - predicted) < SAME:
+            return replace(before, is_open=False, predicted=predicted, found=found)
     made = _rival_of(found, log_odds, contact, before)
-    return replace(made, foretold=log_odds)
+    return replace(made, predicted=log_odds)
 
 
-def as_solved(found: Foreseen, log_odds: float, contact: FloatArray, before: Rival | None) -> Rival:
+def as_solved(
+    found: Prediction, log_odds: float, contact: FloatArray, before: Rival | None
+) -> Rival:
     """A rival as it was solved for."""
     made = _rival_of(found, log_odds, contact, before)
-    return replace(made, is_solved=True, foretold=before.foretold if before else None)
+    return replace(made, is_solved=True, predicted=before.predicted if before else None)
 
 
-def _rival_of(found: Foreseen, log_odds: float, contact: FloatArray, before: Rival | None) -> Rival:
+def _rival_of(
+    found: Prediction, log_odds: float, contact: FloatArray, before: Rival | None
+) -> Rival:
     if before is not None:
         log_odds = before.mean(log_odds)
     is_one = len(found.contacts) == 1
@@ -149,7 +153,7 @@ def turned(
             log_odds=rival.log_odds - log_odds,
             difference=rival.difference - moved * rival.is_one,
             is_solved=rival.is_solved and is_solved,
-            foretold=None,
+            predicted=None,
             found=None,
         )
         for other, rival in rivals.items()
@@ -183,7 +187,7 @@ def opened(rivals: Rivals, gain: float) -> Rivals:
         kind: replace(
             one,
             is_open=one.is_open or one.log_odds >= least or kind is Kind.NONE,
-            is_solved=one.is_solved and one.foretold is not None,
+            is_solved=one.is_solved and one.predicted is not None,
             before=None,
             found=None,
         )

@@ -6,7 +6,7 @@ A frame that is of the same scene leaves the belief as it is. Else contacts are 
 last moved, and fitted to all sheets at once. Where that does not explain the data, what is left of
 the contacts, what is missing beside them and a cold start compete. Then each contact is asked by
 itself what it is: even, rounded, a ring, falling towards the edge, two contacts, or none. What
-each would come to is foreseen without a solve (`foreseen`), and solved for where that is likely.
+each would come to is predicted without a solve (`prediction`), and solved for where that is likely.
 The evidence decides, and what it leaves open is kept as rivals, whose share is part of what is
 shown. What one frame's budget does not finish, the next one goes on with.
 """
@@ -23,11 +23,11 @@ from tactomo_protocol import Channel
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.methods.account import Account, Frame, account_of, descended
 from tactomo_models.methods.contact_search import ContactSearch
-from tactomo_models.methods.foreseen import Foreseen, at_end, foreseen, with_kind
 from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
+from tactomo_models.methods.prediction import Prediction, at_end, predict, with_kind
 from tactomo_models.methods.rivals import (
     Rivals,
-    as_foreseen,
+    as_predicted,
     as_solved,
     choices,
     in_another_frame,
@@ -56,10 +56,10 @@ FEW_STEPS = 4  # of starts that are compared: a start's cost says little before
 # Of a fit in one go, before what is left is looked at; of one that is unexplained, which may have
 # far to go.
 STEPS, FAR_STEPS = 4, 20
-HOPELESS = -6.0  # logarithm of odds: what is foreseen below is asked no more
-SURE_STEPS = 6  # of a fit of two contacts from afar, before what it foresees is believed
-# Of chi-squared: what the Jacobian foresees of a last step is taken for true, without a solve.
-FORESEEN = 0.5
+HOPELESS = -6.0  # logarithm of odds: what is predicted below is asked no more
+SURE_STEPS = 6  # of a fit of two contacts from afar, before what it predicts is believed
+# Of chi-squared: a check ends where the Jacobian predicts that no more is left to gain.
+CHECKED = 0.5
 # Chi-squared over the count of data, from which a contact is missing rather than of another kind.
 SURPRISE = 2.0
 ROUNDS = 4  # of questions, each after what the last one changed
@@ -423,9 +423,9 @@ class Search:
         return [kind for kind in kinds if kind is not own]
 
     def _unasked(self, belief: Belief, frame: Frame) -> list[tuple[int, Kind]]:
-        """Contacts and kinds that are still to be asked, of which the Jacobian foresees anything.
+        """Contacts and kinds that are still to be asked, of which the Jacobian predicts anything.
 
-        Of two contacts in place of one that explains little it foresees nothing.
+        Of two contacts in place of one that explains little it predicts nothing.
         """
         is_far = self._explains_little(belief.account, frame)
         return [
@@ -436,13 +436,13 @@ class Search:
         ]
 
     def _asked(self, belief: Belief, asks: list[tuple[int, Kind]], frame: Frame) -> Belief:
-        """Foresee what contacts would come to be of other kinds."""
+        """Predict what contacts would come to be of other kinds."""
         account, rivals = belief.account, [dict(mine) for mine in belief.rivals]
         now = at_end(self.fit, account, frame).log_evidence
-        found = foreseen(self.fit, self.field, account, asks, frame)
+        found = predict(self.fit, self.field, account, asks, frame)
         for (k, kind), each in zip(asks, found, strict=True):
             before, log_odds = rivals[k].get(kind), each.log_evidence - now
-            rivals[k][kind] = as_foreseen(each, log_odds, account.contacts[k], before)
+            rivals[k][kind] = as_predicted(each, log_odds, account.contacts[k], before)
         for _ in {k for k, _ in asks}:
             frame.budget.spend(account.fitted)  # about what asking a contact takes
         return replace(belief, rivals=tuple(rivals))
@@ -482,14 +482,14 @@ class Search:
         now: float,  # the log evidence of the field as it is
         frame: Frame,
         steps: int = STEPS,  # no more than these
-        sure: int = 0,  # of them before what is foreseen to be hopeless is believed
-    ) -> Foreseen:
+        sure: int = 0,  # of them before what is predicted to be hopeless is believed
+    ) -> Prediction:
         """What other contacts come to, by a fit that ends early where that is hopeless."""
         found = at_end(self.fit, solved, frame, own)
         for taken in range(steps):
             is_hopeless = found.log_evidence - now < HOPELESS
             # A step that would lose is cut at a limit: the end is still far.
-            if 0 <= found.gain * solved.unit < FORESEEN or (is_hopeless and taken >= sure):
+            if 0 <= found.gain * solved.unit < CHECKED or (is_hopeless and taken >= sure):
                 break
             solved = self._descended(solved, frame, 1)
             found = at_end(self.fit, solved, frame, own)
@@ -500,22 +500,19 @@ class Search:
         account = belief.account
         for choice in choices(belief.rivals, LIKELIER):
             changed = self._changed(belief, choice, frame)
-            log_odds = changed.account.log_evidence - account.log_evidence
+            gain = changed.account.log_evidence - account.log_evidence
             (k, kind), *more = choice.items()
-            rival = belief.rivals[k][kind]
-            if not more:
-                log_odds = rival.mean(log_odds)
-            if log_odds >= LIKELIER:
+            before = belief.rivals[k][kind]
+            if (gain if more else before.mean(gain)) >= LIKELIER:
                 explained = frame.likelihood.explains(changed.account.chi_squared)
                 born = None if explained else self._missed(belief, frame)
                 others = [born] if born else []
                 return max([changed, *others], key=lambda one: one.account.log_evidence)
             if not more:
-                if rival.is_one:
-                    difference = changed.account.contacts[k] - account.contacts[k]
-                    rival = replace(rival, difference=difference)
-                mine = {**belief.rivals[k], kind: replace(rival, log_odds=log_odds, is_solved=True)}
-                return self._with_rivals(belief, k, mine)
+                own = np.arange(k, k + 1 + changed.account.family.count - account.family.count)
+                found = at_end(self.fit, changed.account, frame, own)
+                refused = as_solved(found, gain, account.contacts[k], before)
+                return self._with_rivals(belief, k, {**belief.rivals[k], kind: refused})
         return None
 
     @staticmethod

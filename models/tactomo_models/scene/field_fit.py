@@ -35,9 +35,9 @@ from tactomo_models.scene.sheet_response import SheetResponse, responses_of
 from tactomo_models.sensor.description import SensorDescription
 
 SETTLED = 5e-3  # share of the cost below which another gain is not worth a step
-# The same as the last step's Jacobian foresees it. With 5e-3 another 5 % of the work is saved, but
+# The same, as the last step's Jacobian predicts it. With 5e-3 another 5 % of the work is saved, but
 # one of 36 scenes then goes another way, at a correlation lower by 0.13.
-FORESEEN = 1e-3
+PREDICTED = 1e-3
 # Processor time on a quiet core of the 2.5 GHz class, by least squares over frames of all kinds of
 # scenes, to 22 %. Measured on a busy core, divided by 1.3: by so much cold frames took longer than
 # on a quiet one.
@@ -109,7 +109,7 @@ class FittedField:
 
 @dataclass(frozen=True)
 class Step:
-    """What another drawing changes, as far as the Jacobian foresees it."""
+    """What another drawing changes, as far as the Jacobian predicts it."""
 
     residual: FloatArray  # (sum M + K,) added to the weighted residual
     by_parameters: FloatArray  # (sum M + K, N) derivative by the drawing's free parameters
@@ -321,7 +321,7 @@ class FieldFit:
     def steps_to(
         self, fitted: FittedField, others: Sequence[Drawing], measured: Measured
     ) -> list[Step]:
-        """Foresee what each of other drawings changes, from the fitted field and without a solve.
+        """Predict what each of other drawings changes, from the fitted field and without a solve.
 
         The voltages go by the nodes' conductivities as the Jacobian has it, but a step from c to c'
         counts as that of a small disc, 2 c (c' - c) / (c' + c): in one that conducts well there is
@@ -402,13 +402,13 @@ class FieldFit:
             # No gain because the budget ended says nothing about a minimum.
             settled = 0 < gain < SETTLED * fitted.cost or better.damping >= MAX_DAMPING
             if gain > 0 and not settled:
-                settled = self.foreseen(better) < FORESEEN * better.cost
+                settled = self.predicted_gain(better) < PREDICTED * better.cost
             fitted = replace(better, converged=settled)
             if settled or budget.over:
                 break
         return fitted
 
-    def foreseen(self, fitted: FittedField) -> float:
+    def predicted_gain(self, fitted: FittedField) -> float:
         """What further steps would gain in cost, by the Jacobian of the last one: no solve."""
         assert fitted.jacobian is not None
         normal, gradient = self.normal_equations(fitted, fitted.jacobian)

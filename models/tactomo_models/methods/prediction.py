@@ -1,4 +1,4 @@
-"""What a field of other contacts would come to, foreseen from the Jacobian without a solve.
+"""What a field of other contacts would come to, predicted from the Jacobian without a solve.
 
 Voltages go by the conductivity of nodes. From the field as it was solved, other contacts are a step
 of conductivities; the residual there and its derivative follow to first order, and one step of
@@ -32,7 +32,7 @@ MAX_LIMITED = 4  # times that parameters are held at their limits, before what i
 
 
 @dataclass(frozen=True)
-class Foreseen:
+class Prediction:
     """The end of a fit."""
 
     log_evidence: float
@@ -56,13 +56,13 @@ class Foreseen:
         return np.asarray(sigmas[self.own])
 
 
-def foreseen(
+def predict(
     fit: FieldFit,
     bare: PressureField,
     account: Account,
     asks: Sequence[tuple[int, Kind]],
     frame: Frame,
-) -> list[Foreseen]:
+) -> list[Prediction]:
     """What a fit would come to with one contact of another kind, for each contact and kind asked.
 
     Args:
@@ -102,7 +102,7 @@ class _Begun:
 
 def _of_kind(
     fit: FieldFit, account: Account, k: int, begun: _Begun, step: Step, frame: Frame
-) -> Foreseen:
+) -> Prediction:
     family, each, own = begun.family, begun.each, begun.own
     old, light = account.family, account.is_hardly_pressed[k]
     is_own = np.isin(np.arange(family.count), own)
@@ -128,7 +128,9 @@ def with_kind(
     return each, np.arange(k, k + len(contacts))
 
 
-def at_end(fit: FieldFit, account: Account, frame: Frame, own: IntArray | None = None) -> Foreseen:
+def at_end(
+    fit: FieldFit, account: Account, frame: Frame, own: IntArray | None = None
+) -> Prediction:
     """What a fit comes to where it goes on, and some of its contacts; all if None."""
     fitted = account.fitted
     own = np.arange(account.family.count) if own is None else own
@@ -185,7 +187,7 @@ class _At:
     is_below: BoolArray  # (K,) contacts whose peaks stay below the graded sheet's onset
 
 
-def _end(fit: FieldFit, at: _At, frame: Frame, own: IntArray) -> Foreseen:
+def _end(fit: FieldFit, at: _At, frame: Frame, own: IntArray) -> Prediction:
     family, likelihood, J = at.family, frame.likelihood, at.jacobian
     precision, offset = fit.prior_of(family, at.parameters, at.log_ratio)
     normal = J.T @ J
@@ -199,7 +201,7 @@ def _end(fit: FieldFit, at: _At, frame: Frame, own: IntArray) -> Foreseen:
     # A peak just above the onset is as uncertain as the sheet tells there, not as before any data.
     information = likelihood.information(J, chi_squared) + np.diag(precision)
     log_ratio = at.log_ratio + float(step[-1])
-    return Foreseen(found, family.split(parameters), log_ratio, gain, own, family, information)
+    return Prediction(found, family.split(parameters), log_ratio, gain, own, family, information)
 
 
 def _newton(fit: FieldFit, at: _At, normal: FloatArray, gradient: FloatArray) -> FloatArray:

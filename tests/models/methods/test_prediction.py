@@ -1,4 +1,4 @@
-"""What another kind of contact would come to, foreseen without a solve: as a fit of all has it."""
+"""What another kind of contact would come to, predicted without a solve: as a fit of all has it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pressed import PLENTY_S, Sensor, contact, contacts, data_of
 from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.methods.account import Account, Frame, account_of, descended
-from tactomo_models.methods.foreseen import at_end, foreseen, start_of
 from tactomo_models.methods.kinds import Kind
+from tactomo_models.methods.prediction import at_end, predict, start_of
 from tactomo_models.physics.bare_sheet import solve_bare_sheet
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import mesh_sheet
@@ -97,7 +97,7 @@ def test_one_solve_where_it_was_foreseen_says_what_a_fit_comes_to(
     sensor: Sensor, gap_m: float, pressed: str, kind: Kind
 ) -> None:
     account, frame = even_fit(sensor, gap_m, pressed)
-    [found] = foreseen(sensor.fit, sensor.field, account, [(0, kind)], frame)
+    [found] = predict(sensor.fit, sensor.field, account, [(0, kind)], frame)
     family = sensor.family(found.every)
     once = sensor.fit.evaluate(family, family.join(found.every), found.log_ratio, frame.measured)
     end = at_end(sensor.fit, account_of(sensor.fit, once, frame), frame, found.own)
@@ -112,14 +112,14 @@ def test_one_solve_where_it_was_foreseen_says_what_a_fit_comes_to(
 
 def test_what_stays_as_it_is_is_as_likely(sensor: Sensor, gap_m: float) -> None:
     account, frame = even_fit(sensor, gap_m, "even")
-    [same] = foreseen(sensor.fit, sensor.field, account, [(0, Kind.EVEN)], frame)
+    [same] = predict(sensor.fit, sensor.field, account, [(0, Kind.EVEN)], frame)
     assert same.log_evidence == pytest.approx(account.log_evidence, abs=0.1)
     assert same.contacts == pytest.approx(account.contacts[:1], abs=0.02)
 
 
 def test_nothing_in_place_of_a_contact_is_hardly_likely(sensor: Sensor, gap_m: float) -> None:
     account, frame = even_fit(sensor, gap_m, "even")
-    [nothing] = foreseen(sensor.fit, sensor.field, account, [(0, Kind.NONE)], frame)
+    [nothing] = predict(sensor.fit, sensor.field, account, [(0, Kind.NONE)], frame)
     assert nothing.log_evidence < account.log_evidence - 20
     assert len(nothing.contacts) == 0
 
@@ -127,7 +127,7 @@ def test_nothing_in_place_of_a_contact_is_hardly_likely(sensor: Sensor, gap_m: f
 def test_what_is_foreseen_is_not_solved_for(sensor: Sensor, solves: list[int]) -> None:
     account, frame = even_fit(sensor, 0.040, "soft")
     solves.clear()
-    foreseen(sensor.fit, sensor.field, account, [(0, Kind.FALLING), (0, Kind.RING)], frame)
+    predict(sensor.fit, sensor.field, account, [(0, Kind.FALLING), (0, Kind.RING)], frame)
     assert not solves
 
 
@@ -139,5 +139,5 @@ def test_a_light_contact_of_another_kind_stays_below_the_onset(sensor: Sensor) -
     frame = Frame(data, Budget(PLENTY_S))
     account = fitted(sensor, frame, contacts(light))
     for kind in (Kind.FALLING, Kind.RING):
-        [found] = foreseen(sensor.fit, sensor.field, account, [(0, kind)], frame)
+        [found] = predict(sensor.fit, sensor.field, account, [(0, kind)], frame)
         assert found.contacts[0, PEAK] < sensor.field.onset
