@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +25,14 @@ from tactomo_models import (
 from tactomo_models.batch import read_scans, reconstruct_file
 from variants import variant
 
+Arrays = dict[str, Any]
+Run = Callable[..., Arrays]
+
 PRESSES = [(), (Press(0.02, 0.01, 180.0),), (Press(-0.03, 0.0, 160.0), Press(0.035, 0.03, 190.0))]
 
 
 @pytest.fixture
-def arrays(skin: Skin) -> dict[str, Any]:
+def arrays(skin: Skin) -> Arrays:
     scans = [skin.scan(*presses) for presses in PRESSES]
     rest = skin.reference(50)
     assert rest.magnitude is not None
@@ -48,24 +52,28 @@ def _artifact_at_hand(
     monkeypatch.setattr("tactomo_models.methods.method.load_or_build_artifact", lambda _: artifact)
 
 
-def run(
-    tmp_path: Path, paper: SensorDescription, arrays: dict[str, Any], method: str = "auto"
-) -> dict[str, Any]:
-    np.savez(tmp_path / "in.npz", **arrays)
-    made = reconstruct_file(
-        tmp_path / "in.npz", tmp_path / "out.npz", description=paper, method=method
-    )
-    with np.load(tmp_path / "out.npz") as stored:
-        out = dict(stored)
-    assert made.frames == len(out["map"])
-    return out
+@pytest.fixture
+def run(tmp_path: Path, paper: SensorDescription) -> Run:
+    """Reconstruct arrays by a method, of the paper's sensor or another: the arrays of the file."""
+
+    def reconstruct(
+        arrays: Arrays, method: str = "auto", sensor: SensorDescription = paper
+    ) -> Arrays:
+        np.savez(tmp_path / "in.npz", **arrays)
+        made = reconstruct_file(
+            tmp_path / "in.npz", tmp_path / "out.npz", description=sensor, method=method
+        )
+        with np.load(tmp_path / "out.npz") as stored:
+            out = dict(stored)
+        assert made.frames == len(out["map"])
+        return out
+
+    return reconstruct
 
 
 @pytest.mark.slow
-def test_the_arrays_are_those_of_the_contract(
-    tmp_path: Path, paper: SensorDescription, arrays: dict[str, Any]
-) -> None:
-    out = run(tmp_path, paper, arrays)
+def test_the_arrays_are_those_of_the_contract(run: Run, arrays: Arrays) -> None:
+    out = run(arrays)
     assert out["map"].shape == out["structure"].shape == (3, 51, 51)
     assert out["map"].dtype == out["structure"].dtype == np.float32
     assert out["flags"].dtype == np.uint32
@@ -88,11 +96,11 @@ def test_the_arrays_are_those_of_the_contract(
 
 
 def test_contacts_of_a_mounted_sheet_have_their_place_on_the_robot(
-    tmp_path: Path, paper: SensorDescription, arrays: dict[str, Any]
+    run: Run, paper: SensorDescription, arrays: Arrays
 ) -> None:
     cylinder = {"radius_m": 0.05, "position_m": (0.0, 0.0, 0.3)}
     mounted = variant(paper, mount={"frame": "left_forearm", "cylinder": cylinder})
-    out = run(tmp_path, mounted, arrays, "tikhonov")
+    out = run(arrays, "tikhonov", mounted)
     assert len(out["contact_frame"])
     assert set(out["contact_mount_frame"].tolist()) == {"left_forearm"}
     angle = out["contact_x_mm"] * 1e-3 / 0.05
@@ -100,36 +108,32 @@ def test_contacts_of_a_mounted_sheet_have_their_place_on_the_robot(
     assert out["contact_normal"] == pytest.approx(normal)
     up = np.outer(0.3 + out["contact_y_mm"] * 1e-3, [0, 0, 1])
     assert out["contact_position_m"] == pytest.approx(0.05 * normal + up)
-    flat = run(tmp_path, paper, arrays, "tikhonov")
+    flat = run(arrays, "tikhonov")
     assert np.isnan(flat["contact_position_m"]).all()
     assert flat["contact_position_m"].shape == (len(flat["contact_frame"]), 3)
 
 
 @pytest.mark.parametrize("absent", ["missing", "all NaN"])
-def test_a_single_channel_is_reconstructed_linearly(
-    tmp_path: Path, paper: SensorDescription, arrays: dict[str, Any], absent: str
-) -> None:
+def test_a_single_channel_is_reconstructed_linearly(run: Run, arrays: Arrays, absent: str) -> None:
     if absent == "missing":
         del arrays["structure"]
     else:
         arrays["structure"] = np.full_like(arrays["structure"], np.nan)
-    out = run(tmp_path, paper, arrays)
+    out = run(arrays)
     assert np.isfinite(out["map"]).all()
     assert out["map"][1].max() > 0.01
 
 
 @pytest.mark.slow
-def test_tikhonov_can_be_asked_for(
-    tmp_path: Path, paper: SensorDescription, arrays: dict[str, Any]
-) -> None:
-    linear, nonlinear = (run(tmp_path, paper, arrays, m)["map"] for m in ("tikhonov", "levelset"))
+def test_tikhonov_can_be_asked_for(run: Run, arrays: Arrays) -> None:
+    linear, nonlinear = (run(arrays, m)["map"] for m in ("tikhonov", "levelset"))
     assert linear[1].std() < nonlinear[1].std()
 
 
 def test_bad_input_is_refused_with_what_is_needed(
-    tmp_path: Path, paper: SensorDescription, arrays: dict[str, Any]
+    run: Run, tmp_path: Path, paper: SensorDescription, arrays: Arrays
 ) -> None:
-    bad: list[tuple[dict[str, Any], str]] = [
+    bad: list[tuple[Arrays, str]] = [
         ({}, "none of the channels"),
         ({**arrays, "magnitude": np.zeros((3, 192))}, "T x 208"),
         ({**arrays, "magnitude": np.zeros((2, 208))}, "differ in length"),
@@ -140,9 +144,9 @@ def test_bad_input_is_refused_with_what_is_needed(
     ]
     for content, said in bad:
         with pytest.raises(DataError, match=said):
-            run(tmp_path, paper, content)
+            run(content)
     with pytest.raises(MethodError, match="unknown method"):
-        run(tmp_path, paper, arrays, "magic")
+        run(arrays, "magic")
     with pytest.raises(DataError, match=r"cannot write.*no folder"):
         reconstruct_file(tmp_path / "in.npz", tmp_path / "no folder" / "x", description=paper)
 
@@ -187,7 +191,7 @@ def test_a_damaged_archive_is_refused_or_read_as_it_was(
 
 @pytest.mark.slow
 def test_progress_is_told_frame_by_frame(
-    tmp_path: Path, paper: SensorDescription, arrays: dict[str, Any]
+    tmp_path: Path, paper: SensorDescription, arrays: Arrays
 ) -> None:
     told: list[tuple[int, int]] = []
     np.savez(tmp_path / "in.npz", **arrays)
@@ -202,11 +206,11 @@ def test_progress_is_told_frame_by_frame(
 
 @pytest.mark.slow
 def test_a_scan_that_was_not_taken_is_flagged_and_the_others_go_on(
-    tmp_path: Path, paper: SensorDescription, arrays: dict[str, Any]
+    run: Run, arrays: Arrays
 ) -> None:
     arrays["structure"][1] = np.nan
     arrays["magnitude"][2] = np.nan
-    out = run(tmp_path, paper, arrays)
+    out = run(arrays)
     names = [Flag(int(flags)).names() for flags in out["flags"]]
     assert names == [[], ["structure_missing"], ["magnitude_missing"]]
     assert np.isnan(out["structure"][1]).all()
@@ -215,7 +219,7 @@ def test_a_scan_that_was_not_taken_is_flagged_and_the_others_go_on(
 
 
 def test_scans_at_rest_tell_their_noise(
-    tmp_path: Path, paper: SensorDescription, skin: Skin, arrays: dict[str, Any]
+    run: Run, tmp_path: Path, paper: SensorDescription, skin: Skin, arrays: Arrays
 ) -> None:
     taken = [skin.scan() for _ in range(21)]
     rest = {name: np.array([scan[name] for scan in taken]) for name in taken[0]}
@@ -230,12 +234,12 @@ def test_scans_at_rest_tell_their_noise(
     assert reference.is_noise_measured
     for name in ("magnitude", "structure", "magnitude_noise", "structure_noise"):
         np.testing.assert_array_equal(getattr(reference, name), getattr(expected, name))
-    out = run(tmp_path, paper, arrays)
+    out = run(arrays)
     assert out["contact_frame"].tolist() == [1, 2, 2]
 
 
 def test_a_voltage_that_no_scan_at_rest_has_is_left_out(
-    tmp_path: Path, paper: SensorDescription, skin: Skin, arrays: dict[str, Any]
+    tmp_path: Path, paper: SensorDescription, skin: Skin, arrays: Arrays
 ) -> None:
     rest = np.array([skin.scan()["magnitude"] for _ in range(5)])
     rest[:, 3] = np.nan
@@ -248,7 +252,7 @@ def test_a_voltage_that_no_scan_at_rest_has_is_left_out(
 @pytest.mark.slow
 @pytest.mark.parametrize("averaged", [1, 20, "without noise"])
 def test_the_noise_is_that_of_the_scans_however_good_the_reference(
-    tmp_path: Path, paper: SensorDescription, simulator: SkinSimulator, averaged: int | str
+    run: Run, simulator: SkinSimulator, averaged: int | str
 ) -> None:
     """A file does not say how its reference was made; noise must not look like pressing."""
     skin = Skin(simulator, noise_share=0.01)
@@ -257,8 +261,6 @@ def test_the_noise_is_that_of_the_scans_however_good_the_reference(
         rest = skin.reference(averaged)
     scans = [skin.scan(*presses) for presses in [(), (), PRESSES[1], PRESSES[2], (), ()]]
     out = run(
-        tmp_path,
-        paper,
         {name: np.array([scan[name] for scan in scans]) for name in scans[0]}
         | {"magnitude_reference": rest.magnitude, "structure_reference": rest.structure},
     )

@@ -30,11 +30,17 @@ def built(small: SensorDescription) -> Artifact:
     return build_artifact(small)
 
 
+@pytest.fixture
+def file(built: Artifact, tmp_path: Path) -> Path:
+    """The artifact, kept in a new folder."""
+    path = tmp_path / "new folder" / "small.npz"
+    save_artifact(built, path)
+    return path
+
+
 def test_an_artifact_comes_back_as_it_was(
-    built: Artifact, small: SensorDescription, tmp_path: Path
+    file: Path, built: Artifact, small: SensorDescription
 ) -> None:
-    file = tmp_path / "new folder" / "small.npz"
-    save_artifact(built, file)
     read = load_artifact(file, small)
     assert str(file) in Path("/proc/self/maps").read_text()  # what is large stays in the file
     assert read.regularisation == built.regularisation
@@ -46,11 +52,7 @@ def test_an_artifact_comes_back_as_it_was(
     assert [entry.name for entry in file.parent.iterdir()] == ["small.npz"]
 
 
-def test_an_artifact_of_another_sensor_is_refused(
-    built: Artifact, paper: SensorDescription, tmp_path: Path
-) -> None:
-    file = tmp_path / "small.npz"
-    save_artifact(built, file)
+def test_an_artifact_of_another_sensor_is_refused(file: Path, paper: SensorDescription) -> None:
     with pytest.raises(ArtifactError, match=r"built for.*'small'.*'paper_square'.*models build"):
         load_artifact(file, paper)
     with pytest.raises(ArtifactError):
@@ -61,10 +63,8 @@ def test_an_artifact_of_another_sensor_is_refused(
     "damage", ["cut", "empty", "text", "pickle", "one array", "other arrays", "future", "a folder"]
 )
 def test_a_damaged_or_foreign_file_is_refused(
-    built: Artifact, small: SensorDescription, tmp_path: Path, damage: str
+    file: Path, small: SensorDescription, damage: str
 ) -> None:
-    file = tmp_path / "artifact.npz"
-    save_artifact(built, file)
     whole = file.read_bytes()
     if damage == "other arrays":
         np.savez(file, a=np.zeros(3))
@@ -84,12 +84,8 @@ def test_a_damaged_or_foreign_file_is_refused(
         load_artifact(file, small)
 
 
-def test_a_header_that_says_fewer_numbers_is_refused(
-    built: Artifact, small: SensorDescription, tmp_path: Path
-) -> None:
+def test_a_header_that_says_fewer_numbers_is_refused(file: Path, small: SensorDescription) -> None:
     """The checksum is beyond what such a header has one read."""
-    file = tmp_path / "small.npz"
-    save_artifact(built, file)
     content = bytearray(file.read_bytes())
     digit = content.index(b"'shape': (", content.index(b"greens.npy")) + len(b"'shape': (")
     content[digit] -= 1
@@ -149,21 +145,16 @@ def test_a_disk_that_fills_up_leaves_nothing_under_the_name(
     folder = tmp_path / "full"
     folder.mkdir()
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
-    try:
-        with pytest.raises(ArtifactError, match=r"cannot write .*small\.npz.*free some space"):
-            save_artifact(built, folder / "small.npz")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert not list(folder.iterdir())
-    save_artifact(built, folder / "small.npz")
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
-    try:
-        with pytest.raises(ArtifactError):
-            save_artifact(built, folder / "small.npz")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert load_artifact(folder / "small.npz", small).sensor == "small", "the old one stays"
+    for is_there in (False, True):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+        try:
+            with pytest.raises(ArtifactError, match=r"cannot write .*small\.npz.*free some space"):
+                save_artifact(built, folder / "small.npz")
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert len(list(folder.iterdir())) == is_there
+        save_artifact(built, folder / "small.npz")
+    assert load_artifact(folder / "small.npz", small).sensor == "small"
 
 
 @pytest.mark.usefixtures("own_cache")
