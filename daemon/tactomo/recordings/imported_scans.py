@@ -48,6 +48,7 @@ from tactomo.scans import MAX_QUADRATURE
 # Of times and electrodes' numbers: seconds since 1970 until 2096.
 MOST = 4e9
 SLOWEST_HZ, FASTEST_HZ = 1e-3, 1e6  # what a hello can say
+SIGN_SCANS = 4096  # of a longer file, so many tell the signs
 TURNED_ROUND = 0.9  # share of voltages of the wrong sign; under an object few change theirs
 AT_REST = ("reference", "baseline", "rest", "empty", "vh")  # vh: homogeneous, in EIDORS' tutorials
 
@@ -198,7 +199,7 @@ def _turned_round(scans: Scans, description: SensorDescription) -> Scans:
     signs = rim_signs(description.pairs, description.electrode_count)
     wrong = []
     for channel, volts in scans.volts.items():
-        known = volts[:, signs != 0] * signs[signs != 0]
+        known = volts[:: 1 + len(volts) // SIGN_SCANS, signs != 0] * signs[signs != 0]
         known = known[np.isfinite(known)]
         if known.size and (known < 0).mean() > TURNED_ROUND:
             wrong.append(channel)
@@ -284,7 +285,7 @@ def _in_phase(
 ) -> tuple[FloatArray, tuple[str, ...], float | None]:
     """Return the volts in phase with the current, notes, and the angle they were turned by."""
     if raw.dtype.kind != "c":
-        return raw.astype(np.float64), (), None
+        return np.asarray(raw, np.float64), (), None
     notes: tuple[str, ...] = ()
     if turn_rad is None:
         turn_rad = -_phase_rad(raw) if _quadrature(raw) > MAX_QUADRATURE else 0.0

@@ -86,3 +86,19 @@ def test_frames_cost_memory_one_at_a_time(tmp_path: Path) -> None:
     with np.load(tmp_path / "maps.npz") as made:
         assert made["map"].shape == (4000, 51, 51)
     assert peaks_mb[1] - peaks_mb[0] < 40, peaks_mb
+
+
+@pytest.mark.slow
+def test_an_import_holds_the_scans_once(tmp_path: Path) -> None:
+    """Of fifty times the frames, the scans alone: 1.7 kB each, and no copies of all of them."""
+    [rest] = SkinSimulator(load_description("tank_disc")).voltages([]).values()
+    noise = np.random.default_rng(0)
+    peaks_mb = []
+    for frames in (400, 20_000):
+        volts = rest * (1 + 1e-4 * noise.normal(size=(frames, len(rest))))
+        np.savez(tmp_path / f"{frames}.npz", structure=volts)
+        line = (f"{frames}.npz", f"{frames}.mcap", "-d", "tank_disc", "--rate", "20")
+        ended = rationed(tmp_path, "import", *line)
+        assert ended.status == 0, ended.said
+        peaks_mb.append(ended.peak_mb)
+    assert peaks_mb[1] - peaks_mb[0] < 1.5 * 33, peaks_mb

@@ -355,6 +355,7 @@ def of_arrays(
         named = named or _fitting_pattern(path, arrays, array)
         sensor, layout = named.applied(load_description(ANY_RING)), named.layout
         names, how = (array or "volts",), f"read as {named}; no description of the sheet"
+    del arrays  # else all scans are in memory twice
     read = read_scans(path, sensor, sensor.channels[-1], array=array, pattern=named)
     scans: dict[str, FloatArray] = {}
     times_s: dict[str, FloatArray | None] = {}
