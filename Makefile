@@ -66,7 +66,7 @@ test-peers: $(PEERS_READY)  ## LeRobot and ROS 2 themselves read ours; installs 
 	HF_HOME=$(PEERS)/huggingface HF_HUB_OFFLINE=1 $(PEERS)/bin/python -m pytest -m peers \
 	  tests/learning tests/ros2/test_node.py $(ARGS)
 
-faults: $(READY) ## every fault and measure (an hour), then docs/reliability.md from them
+faults: $(READY) ## every fault and measure (hours; a tenth: ARGS='--scale 0.1'), then docs/reliability.md from them
 	$(BIN)/pytest tests/faults -m '' --reliability docs/reliability.md $(ARGS)
 
 soak: $(READY)   ## a million dual scans as fast as they are taken, and their row of that page

@@ -94,7 +94,7 @@ def test_two_skins_on_one_daemon(
         resting.stop()
         before = len(ears.heard)
         pressing = Playing(first, moving(scenes.one), 20.0)
-        time.sleep(10.0)
+        wait_until(lambda: len(ears.heard) > before + 25, "frames of the first skin")
         pressing.stop()
         other.stop()
     finally:
@@ -104,7 +104,7 @@ def test_two_skins_on_one_daemon(
     frames = ears.heard[before + 5 :]
     one = sum(len(heard.fields["contacts"]) == 1 for heard in frames)
     figure(f"{one} of {len(frames)} frames with the one contact of the first skin")
-    assert one > 0.9 * len(frames) > 9
+    assert one > 0.9 * len(frames)
 
 
 @pytest.mark.faults
@@ -144,6 +144,7 @@ def test_a_tare_under_a_press(
 )
 def test_a_palm_that_comes_lightly(
     tared: Start,
+    skin: PtySkin,
     description: SensorDescription,
     play: Play,
     listen: Listen,
@@ -154,11 +155,17 @@ def test_a_palm_that_comes_lightly(
     volts = [bare.voltages([Press(0.0, 0.0, kpa, PALM_RADIUS_M)]) for kpa in levels_kpa]
     daemon = tared()
     ears = listen(daemon)
+    wait_until(lambda: daemon.status()["subscribers"] == 1, "the subscription")
+    before = daemon.status()["dropped_scans"]
+    already = len(ears.heard)
     each = round(PALM_S * 20 / len(volts))
-    play(itertools.chain.from_iterable([level] * each for level in volts)).join()
+    sent = play(itertools.chain.from_iterable([level] * each for level in volts)).join()
+    ears.wait(lambda h: h.fields["scan_counter"] == skin.counter - 1, "the last frame")
+    frames = ears.heard[already:]
+    dropped = daemon.status()["dropped_scans"] - before
     shown: Counter[Any] = Counter(
-        "flagged" if heard.fields["flags"] else len(heard.fields["contacts"])
-        for heard in ears.heard
+        "flagged" if heard.fields["flags"] else len(heard.fields["contacts"]) for heard in frames
     )
-    figure(", ".join(f"{count} of {what} contacts" for what, count in shown.most_common()))
-    assert sum(shown.values()) > 0.9 * each * len(volts)
+    told = ", ".join(f"{count} of {what} contacts" for what, count in shown.most_common())
+    figure(f"{told}, {dropped} dropped")
+    assert len(frames) + dropped == sent

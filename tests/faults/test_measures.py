@@ -72,8 +72,8 @@ CASES = [
 @pytest.mark.measure(
     "Latency: {scene}, {rate}/s; {loops} busy loops, the daemon at {under}",
     "none; told as it is",
-    "for 100 s (times `--scale`); what slides does so at 10 cm/s, what moves is 4 mm further in "
-    "each; *read*: from the last byte read to publication; processor time by the kernel's account",
+    "what slides does so at 10 cm/s, what moves is 4 mm further in each; *read*: from the last "
+    "byte read to publication; processor time by the kernel's account",
 )
 def test_latency(
     tared: Start,
@@ -114,7 +114,7 @@ def test_latency(
         daemon.kill()
     tiers = Counter(h.fields["tier"] for h in heard).most_common()
     figure(
-        f"read {percentiles([h.read_age_ms for h in heard])}; published "
+        f"over {seconds:.0f} s: read {percentiles([h.read_age_ms for h in heard])}; published "
         f"{percentiles([h.published_age_ms for h in heard])}; arrived "
         f"{percentiles([h.age_ms for h in heard])}; {len(heard)} frames "
         f"({', '.join(f'{tier} {count}' for tier, count in tiers)}), {dropped} dropped; "

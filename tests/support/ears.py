@@ -98,8 +98,8 @@ class Ears:
 
 
 def percentiles(values: list[float]) -> str:
-    """Say p50, p99, p99.9 and the worst of some milliseconds: what so many values can have."""
-    shares = [share for share in (50, 99, 99.9) if len(values) * (100 - share) >= 100]
+    """Say p50, p99 and p99.9 of some milliseconds, those that ten values exceed, and the worst."""
+    shares = [share for share in (50, 99, 99.9) if len(values) * (100 - share) >= 1000]
     found = zip(shares, np.percentile(values, shares), strict=True)
     told = "".join(f"p{share:g} {value:.2f}, " for share, value in found)
     return f"{told}worst {max(values):.2f} ms"
