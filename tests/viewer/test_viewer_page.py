@@ -444,6 +444,13 @@ def test_rate_latency_method_and_quality_are_shown(page: Page) -> None:
     assert page["made-by"].text == "levelset"
     assert page["made-by-reason"].text == "two contacts"
     assert page["misfit"].text == "3.2 σ"
+    height = "return document.getElementById('made-by').closest('.card').offsetHeight"
+    heights = set()
+    for reason in ("quiet", "no change above the noise"):
+        page.skin.frame |= {"tier_reason": reason}
+        wait_until(lambda reason=reason: page["made-by-reason"].text == reason)
+        heights.add(page.js(height))
+    assert len(heights) == 1  # room is kept: nothing below jumps
     page.skin.frame = {}
     wait_until(lambda: page["quality"].text == "good")
     page.skin.press(0, 0)
