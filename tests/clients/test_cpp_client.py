@@ -365,7 +365,7 @@ def test_with_keys(probe: Path, start: Callable[..., DaemonProcess], tmp_path: P
     told = subprocess.run(
         [probe, "control", daemon.control, "status", "", desk], capture_output=True, text=True
     )
-    assert told.stderr.startswith("bad_keys: others than its owner may read")
+    assert told.stderr.startswith("bad_keys: users other than the owner may read")
 
 
 @pytest.mark.parametrize(

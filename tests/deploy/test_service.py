@@ -146,7 +146,7 @@ def test_what_stands_in_the_way_is_said(tactomo: Run, monkeypatch: pytest.Monkey
     if not Path("/run/systemd/system").exists():
         said = tactomo("service", "install", "palm", *here)
         assert said.returncode == 1
-        assert "systemd does not run this computer" in said.stderr
+        assert "this computer does not run systemd" in said.stderr
     for place in ("/home/me/venv/bin/python", "/root/.pyenv/bin/python"):
         monkeypatch.setattr("sys.executable", place)
         with pytest.raises(ServiceError, match="does not see"):

@@ -354,7 +354,7 @@ def _no_answer(connection: Connection, waited_s: float) -> ControlError:
         )
     return control_error(
         f"{silence}: nothing listens there",
-        "start the daemon with `tactomo daemon` (simulated skin and all: `tactomo demo`), or give "
-        "the address of the one that runs",
+        "start the daemon with `tactomo daemon` (with a simulated skin: `tactomo demo`), or give "
+        "the address of the running daemon",
         "no_answer",
     )

@@ -90,8 +90,8 @@ def read_secret(path: Path) -> tuple[bytes, bytes]:
     mode = path.stat().st_mode & 0o777
     if mode & 0o077 and not _is_credential(path):
         raise KeysError(
-            f"others than its owner may read {path} (mode {mode:04o})",
-            f"if nobody can have copied it: chmod 600 {path}; if somebody can: make new keys",
+            f"users other than the owner may read {path} (mode {mode:04o})",
+            f"if nobody has copied the key: chmod 600 {path}; otherwise make new keys",
         )
     return public, secret
 

@@ -170,11 +170,13 @@ class Browser:
         if kind == "clear":
             self._presses.clear()
             return await self._ask_twin("clear", {})
-        raise ControlError("the page asked for something unknown", name="unknown_command")
+        raise ControlError("the page sent an unknown request", name="unknown_command")
 
     async def _command(self, command: object, arguments: object) -> dict[str, Any]:
         if not isinstance(command, str) or command not in DAEMON_COMMANDS:
-            raise ControlError(f"a page may not command {command!r}", name="unknown_command")
+            raise ControlError(
+                f"a page may not send the command {command!r}", name="unknown_command"
+            )
         allowed, timeout_s = DAEMON_COMMANDS[command]
         if not isinstance(arguments, dict) or not arguments.keys() <= allowed:
             raise ControlError(
@@ -216,7 +218,7 @@ def _asked(message: WSMessage) -> dict[str, Any]:
 
 def _read_only() -> ControlError:
     return ControlError(
-        "this viewer only shows, because it is served beyond its own computer",
+        "this viewer takes no commands, because other computers can open it",
         "open it on that computer, for example through `ssh -L 8750:127.0.0.1:8750`",
         name="read_only",
     )

@@ -104,7 +104,7 @@ class Connection:
         # pyserial's words for it are a guess, and the same for several causes.
         has_gone = is_path(self.url) and not os.path.exists(self.url)
         self.problem = "the device has gone" if has_gone else str(error)
-        self._tell_closed("check the cable; the port is tried again until it is back")
+        self._tell_closed("check the cable; the daemon reopens the port when it is back")
 
     def _note(self, error: TactomoError) -> None:
         """Take note of why the port cannot be opened, and tell it."""

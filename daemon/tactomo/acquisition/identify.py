@@ -57,10 +57,10 @@ def _converse(connection: Connection, baud: int, patience_s: float) -> Answer:
 
 def _silence(received: bytes, packets: int, baud: int) -> str:
     if packets:
-        return "it sends packets, but no hello"
+        return "the device sends packets, but no hello"
     protocol = recognised(received)
     if protocol is not None:
         return f"no hello, but what it sends looks like --protocol {protocol}"
     if received:
         return f"bytes and no packet at {baud} baud: no skin, or another baud rate"
-    return "no answer; a device of another --protocol may wait to be started"
+    return "no answer; a device of another --protocol may wait for a start command"

@@ -58,7 +58,7 @@ UNANSWERED_S: Final = 3.0
 TROUBLES: Final = {
     DeviceState.SILENT: (
         "device_silent",
-        "check its power; it is asked again, and the port is opened anew",
+        "check the device's power; the daemon asks again and reopens the port",
     ),
     DeviceState.GARBAGE: (
         "device_garbled",
@@ -67,7 +67,7 @@ TROUBLES: Final = {
     ),
     DeviceState.IDLE: (
         "device_idle",
-        "it is asked to start again and again; check its trigger, or reset it",
+        "check the device's trigger, or reset the device; the daemon keeps asking it to start",
     ),
 }
 """The event of a device in each state of trouble, and what to do."""
@@ -397,7 +397,7 @@ class PortReader(Worker):
             self._tell(
                 "device_changed",
                 f"{hello.device_id} is where {before.device_id} was",
-                "tare, if another skin was plugged in; `device_ids` keeps foreign ones out",
+                "tare, if another skin was plugged in; `device_ids` refuses other devices",
             )
 
     def _judge(self, hello: Hello) -> Trouble | None:
@@ -525,7 +525,7 @@ class PortReader(Worker):
                 "device_clock_jumped",
                 f"the device's clock jumped, or the device was reset; "
                 f"{times(clock.jumps)} since the start",
-                "if it comes again and again, check the device's supply and its timer",
+                "if this event repeats, check the device's supply and timer",
             )
         if clock.state is not state and clock.state is ClockState.UNUSABLE:
             self._tell(
@@ -533,8 +533,8 @@ class PortReader(Worker):
                 f"the device's clock stands still, or is off by more than "
                 f"{MAX_RATE * 1e6:g} ppm, or its channels go by two; what buffers hold "
                 "up is not seen in the ages",
-                "correct the firmware's clock: one for both channels, in microseconds, read as the "
-                "scan begins",
+                "correct the firmware's clock: one for both channels, in microseconds, read at the "
+                "start of the scan",
             )
         self._clock_seen = (clock.state, clock.jumps)
 

@@ -39,5 +39,5 @@ class WallClock:
             "wall_clock_jumped",
             f"the computer's clock was set {abs(jump_s):.1f} s "
             f"{'ahead' if jump_s > 0 else 'back'}, or the computer slept",
-            "nothing, unless you compare dates across it: go by monotonic times",
+            "nothing, unless you compare dates across it: use monotonic times",
         )

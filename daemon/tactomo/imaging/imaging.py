@@ -297,10 +297,11 @@ class Imaging:
         if share < before:
             self._on_event(
                 "processor_shared",
-                f"others take the processor: this skin got {processor.of_core:.0%} of a core while "
-                f"it computed, and frames get {share:.0%} of their time",
-                "give the daemon more of the processor, or fewer skins; it takes more by itself "
-                "once it can",
+                "other programs use the processor: this skin got "
+                f"{processor.of_core:.0%} of a core while it computed, and frames get "
+                f"{share:.0%} of their time",
+                "give the daemon more of the processor, or fewer skins; frames then get their time "
+                "back",
                 reason=f"{share}",
             )
         elif share == 1:
@@ -376,7 +377,9 @@ class Imaging:
         for stage, seconds in frame.stage_s.items():
             self._time(stage, seconds)
         if frame.failure:
-            step = "frames are tikhonov's until it works: mend it, or choose another method"
+            step = (
+                "frames are tikhonov's until the method works: correct it, or choose another method"
+            )
             self._on_event("method_failed", frame.failure, step)
         return frame
 
@@ -390,7 +393,7 @@ class Imaging:
             self._on_event(
                 "baseline_refused",
                 tracker.refusal,
-                "take off what presses, and away what heats or cools the skin; once it is steady: "
+                "remove whatever presses, heats or cools the skin; once the skin is steady: "
                 "`tactomo tare`",
             )
 

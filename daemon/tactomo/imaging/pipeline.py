@@ -387,7 +387,7 @@ class Pipeline(Worker):
                 "device_restarted",
                 "a device was reset: its scan counter and its clock went back; "
                 f"{times(now.resets)} since the start",
-                "check its supply; tare again if it lost its settings",
+                "check the device's supply; tare again if the device lost its settings",
             )
         if now.zeroed > before.zeroed:
             self._on_event(
@@ -416,7 +416,11 @@ class Pipeline(Worker):
                     channel,
                 )
                 continue
-            step = "" if self._imaging.has_reference(channel) else "tare: it has no reference yet"
+            step = (
+                ""
+                if self._imaging.has_reference(channel)
+                else "run `tactomo tare`: the channel has no reference yet"
+            )
             self._on_event("channel_back", f"{channel} scans come again", step, channel)
 
     def _bring_in_step(self) -> None:

@@ -325,7 +325,8 @@ class Sciospec(ForeignProtocol):
             self.trouble = Trouble(
                 f"the instrument injects at {found[3]} and {found[4]} (from 1), which is "
                 f"not in the pattern of {self.description.name}",
-                "does another program talk to it? Reset it, or correct the description's pattern",
+                "reset the instrument if another program uses it, or correct the description's "
+                "pattern",
             )
 
     def _forget_frame(self) -> None:
@@ -374,7 +375,7 @@ def requests(description: SensorDescription) -> Iterator[Request]:
             f"inject between electrodes {source} and {sink}", message(0xB0, 0x06, source, sink)
         )
     for option in (1, 2, 3):
-        yield Request("say what its data are of", message(0xB2, option, 1))
+        yield Request("say what its data mean", message(0xB2, option, 1))
     yield Request("start", message(DATA_TAG, 1))
 
 

@@ -169,7 +169,7 @@ class _Lines:
         try:
             source, sink = map(int, self._text(number).split())
         except ValueError:
-            raise self._wrong(number, "it is no injection, such as 1 2") from None
+            raise self._wrong(number, "this is not an injection, such as 1 2") from None
         if not min(source, sink) >= 1 or source == sink:
             raise self._wrong(number, f"{source} {sink} is no injection")
         return source, sink
@@ -178,12 +178,12 @@ class _Lines:
         try:
             values = [float(each) for each in self._text(number).split()]
         except ValueError:
-            raise self._wrong(number, "it holds what is no number") from None
+            raise self._wrong(number, "a value is not a number") from None
         if len(values) % 2 or not values or (count is not None and len(values) != 2 * count):
             wanted = "pairs of numbers" if count is None else f"{2 * count} numbers"
             raise self._wrong(number, f"{len(values)} numbers, not {wanted}")
         if not np.isfinite(values).all():
-            raise self._wrong(number, "it holds what is no finite number")
+            raise self._wrong(number, "a value is not a finite number")
         return [complex(*pair) for pair in zip(values[::2], values[1::2], strict=True)]
 
     def _wrong(self, number: int, cause: str, next_step: str = "save it anew") -> EitFileError:

@@ -414,9 +414,9 @@ class Recorder(Worker):
             self._on_event("recording_failed", detail, self._wait(reason))
 
 
-_REST: Final = "see to the disk, then record anew; what was written until then can be replayed"
-_TRIED_AGAIN: Final = "make room on the disk, or see that it can be written; it is tried again"
-_TRY_ELSEWHERE: Final = "see that the daemon may write to its folder of recordings"
+_REST: Final = "check the disk, then record again; the part on the disk can be replayed"
+_TRIED_AGAIN: Final = "make room on the disk, or make it writable; the daemon tries again"
+_TRY_ELSEWHERE: Final = "allow the daemon to write to its folder of recordings"
 _DIED: Final = "the recorder's thread died"
 _REPORT: Final = "restart the daemon, and please report the traceback in its log"
 _TOO_SLOW: Final = f"the disk is too slow: {MAX_QUEUED_BYTES >> 20} MB wait for it"

@@ -508,6 +508,6 @@ def _fields(data: bytes, *needed: str) -> dict[str, Any]:
 
 def _malformed() -> RecordingError:
     return RecordingError(
-        "the recording holds what tactomo does not write",
-        "it was made by another version or another program: record anew",
+        "the recording holds records that tactomo does not write",
+        "another version or another program made it: record again",
     )

@@ -102,8 +102,8 @@ def recover(
         except OSError as error:
             raise RecordingError(
                 f"cannot recover {damaged} to {output}: {error.strerror}",
-                "see that the one can be read and that there is room for the other; where the "
-                "disk itself fails, copy the file with ddrescue first",
+                "check that the damaged file can be read and that the disk has room for the new "
+                "one; if the disk itself fails, copy the file with ddrescue first",
             ) from error
         finally:
             part.unlink(missing_ok=True)

@@ -278,7 +278,7 @@ class Daemon:
             ports=list(self.config.ports),
         )
         for why in self._unused:
-            self._on_event("calibration_refused", why, "until then it is as if there were none")
+            self._on_event("calibration_refused", why, "until then no calibration is used")
 
     def stop(self) -> None:
         """Stop all threads and close everything; may be called twice."""

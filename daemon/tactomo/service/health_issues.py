@@ -25,7 +25,7 @@ FLAG_ERRORS = frozenset(
 FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
     "magnitude_missing": (
         "no scans of the magnitude channel",
-        "check that channel's port and cable; until then nobody knows how hard is pressed",
+        "check that channel's port and cable; until then pressures are unknown",
     ),
     "structure_missing": (
         "no scans of the structure channel",
@@ -41,7 +41,7 @@ FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
         "take everything off; if contacts are still shown then, run `tactomo tare`",
     ),
     "no_usable_scan": (
-        "nothing is measured: that no contact is shown says nothing",
+        "nothing is measured: no contacts does not mean nothing pressed",
         "check the cables, and run `tactomo doctor` to find the leads",
     ),
     "misfit_high": (
@@ -49,11 +49,11 @@ FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
         "take everything off and run `tactomo tare`; if it stays, run `tactomo doctor`",
     ),
     "not_converged": (
-        "the reconstruction ran out of its time",
+        "the reconstruction ran out of time",
         "raise the budget, or free the processor",
     ),
     "invalid_voltage": (
-        "some voltages cannot be right and were left out",
+        "some voltages are impossible and were left out",
         "run `tactomo doctor` to find the lead",
     ),
     "saturated": ("the converter clips", "lower the gain or the current"),
@@ -74,20 +74,20 @@ FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
         "exchange the two plugs, then run `tactomo tare`",
     ),
     "channels_skewed": (
-        "the two channels' scans are not of one instant",
+        "the two channels' scans come from different instants",
         "check the sync line between the two boards",
     ),
     "creeping": (
-        "what was pressed comes back slowly, and may hide a light touch",
+        "the skin recovers slowly from a press, and may hide a light touch",
         "leave the skin alone for a while, or run `tactomo tare` with nothing on it",
     ),
     "untaught": (
-        "no press like this one was taught: the physics alone says where it is",
+        "this press is unlike all taught presses: the physics alone locates it",
         "teach more of the skin by `tactomo teach live`",
     ),
     "companion_missing": (
         "a companion of the sensor description has no reading within its limits",
-        "check its cable and `limits`; the sheets stand alone meanwhile",
+        "check its cable and `limits`; the sheets are used alone meanwhile",
     ),
     "companion_disputed": (
         "a companion contradicts the sheets and is left out",

@@ -168,10 +168,10 @@ def shipped(file: str) -> str:
 
 
 def check_running_systemd() -> None:
-    """Raise ServiceError where systemd does not run this computer."""
+    """Raise ServiceError where this computer does not run systemd."""
     if not Path("/run/systemd/system").is_dir():
         raise ServiceError(
-            "systemd does not run this computer",
+            "this computer does not run systemd",
             "let your own supervisor run `tactomo daemon CONFIGURATION`, or prepare another disk "
             "with --root FOLDER",
             "no_systemd",
@@ -185,7 +185,7 @@ def run(command: Sequence[str]) -> str:
     if done.returncode:
         raise ServiceError(
             f"`{' '.join(command)}` failed: {(done.stderr or done.stdout).strip()}",
-            "put that right and run this again: what is done already stays as it is",
+            "correct this and run the command again; finished steps stay",
         )
     return done.stdout
 

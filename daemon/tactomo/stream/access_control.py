@@ -53,7 +53,7 @@ def load_server_keys(secret: Path, clients: Path) -> ServerKeys:
     """
     if not clients.is_dir():
         raise KeysError(
-            f"there is no folder {clients} of clients that may come in",
+            f"the folder {clients} of allowed clients does not exist",
             f"make it: `mkdir -p {shlex.quote(str(clients))}`; then {how_to_allow(clients)}",
         )
     check_closed(clients)

@@ -79,8 +79,8 @@ def make_pair(folder: Path, name: str, *, is_server: bool = False, force: bool =
     if not force and (secret_file.exists() or public_file.exists()):
         raise KeysError(
             f"there are keys of the name {name!r} in {folder}",
-            "choose another name, or --force to replace them: whoever knows the old ones is then "
-            "locked out",
+            "choose another name, or --force to replace the keys: clients that know the old keys "
+            "can then not connect",
             "keys_exist",
         )
     public, secret = (key.decode("ascii") for key in zmq.curve_keypair())

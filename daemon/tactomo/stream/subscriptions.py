@@ -26,8 +26,8 @@ MAX_READ_AT_ONCE: Final = 2000
 MAX_WAITING: Final = 10 * MAX_READ_AT_ONCE
 CUT_PERIOD_S: Final = 0.25  # time for the ends of all subscriptions to be read
 SUBSCRIBERS_CUT: Final = (
-    "more subscriptions than there can be subscribers for: every connection was cut",
-    "find the client that does this; the others come back by themselves",
+    "too many subscriptions: every connection was cut",
+    "find the client that subscribes so often; other clients reconnect by themselves",
 )
 
 

@@ -254,7 +254,7 @@ def test_channels_that_were_not_measured_are_left_out(tactomo: Run, tmp_path: Pa
         (8, "3", "line 8: 3 frequencies; save one"),
         (19, "1 1", "line 19: 1 1 is no injection"),
         (20, "0.1\t0.2\t0.3", "line 20: 3 numbers, not pairs"),
-        (24, "0.1\tx", "line 24: it holds what is no number"),
+        (24, "0.1\tx", "line 24: a value is not a number"),
         (19, None, "line 19: no injection; it was cut off"),
     ],
 )

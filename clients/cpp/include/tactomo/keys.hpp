@@ -103,9 +103,9 @@ inline void refuse_if_others_read(const std::filesystem::path& path) {
     using std::filesystem::perms;
     const perms open = std::filesystem::status(path).permissions() & (perms::group_all | perms::others_all);
     if (open == perms::none || is_credential(path)) return;
-    throw KeysError("others than its owner may read " + path.string(),
-                    "if nobody can have copied it: chmod 600 " + path.string() +
-                        "; if somebody can: make new keys");
+    throw KeysError("users other than the owner may read " + path.string(),
+                    "if nobody has copied the key: chmod 600 " + path.string() +
+                        "; otherwise make new keys");
 }
 
 /// `~/keys` as a shell would read it.

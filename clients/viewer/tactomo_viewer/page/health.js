@@ -37,7 +37,7 @@ export function verdict(state, now) {
   if (!link.isOpen) {
     if (!hello && now < 1500) return null;
     return banner("viewer-gone", "error", "The viewer's server is gone.",
-      "Trying to reach it again; if it was stopped, start it with `tactomo viewer`.");
+      "The page tries again; if you stopped the server, start it with `tactomo viewer`.");
   }
   if (!status) {
     const waited = now - state.openedAt;
@@ -51,7 +51,7 @@ export function verdict(state, now) {
   }
   if (!isHeard(state, now)) {
     return banner("daemon-gone", "error", "The daemon is gone.",
-      `Last heard ${seconds(ageOf(status, now))} ago; the page goes on by itself when it is back.`);
+      `Last heard ${seconds(ageOf(status, now))} ago; the page continues when the daemon is back.`);
   }
   const { fields } = status;
   if (fields.state === "taring") {
@@ -66,10 +66,10 @@ export function verdict(state, now) {
     return banner("ended", "info", "The replay is at its end.", "The map shows its last frame.");
   }
   if (state.isMoving) {
-    return banner("replay-moving", "info", "The replay is moved.", "The map follows at once.");
+    return banner("replay-moving", "info", "The replay jumps.", "The map follows at once.");
   }
   if (fields.replay?.paused) {
-    return banner("replay-paused", "info", "The replay is paused.", "The map shows the frame at which it stands.");
+    return banner("replay-paused", "info", "The replay is paused.", "The map shows the frame at the slider.");
   }
   const age = ageOf(frame, now);
   if (age > staleAfter(fields, hello)) {

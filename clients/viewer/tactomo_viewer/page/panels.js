@@ -73,8 +73,8 @@ export function showQuality(frame, trusted) {
   list.dataset.flags = key;
   const chips = !trusted ? [chip("not known", "The newest frame is out of date.", "warn")]
     : frame.flags.length ? frame.flags.map((flag) => chip(flag.replaceAll("_", " "), "", "warn"))
-    : isLinear ? [chip("linear: coarse", "One linear step: contacts near each other run together, weak ones are missed.", "warn")]
-    : [chip("good", "Nothing to be wary of.", "good")];
+    : isLinear ? [chip("linear: coarse", "One linear step: contacts near each other merge, weak contacts are missed.", "warn")]
+    : [chip("good", "No flags.", "good")];
   list.replaceChildren(...chips);
 }
 
@@ -100,7 +100,7 @@ export function showStatus(status, isCurrent) {
   const record = byId("record");
   record.setAttribute("aria-pressed", String(Boolean(recording)));
   setText(record, recording ? `Stop · ${bytes(recording.bytes)}` : "Record");
-  record.title = recording ? recording.path : "Record what the ports say to a file";
+  record.title = recording ? recording.path : "Record the bytes of the ports to a file";
   showMethods(status);
 }
 

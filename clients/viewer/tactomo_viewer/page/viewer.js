@@ -311,7 +311,7 @@ function helpText(canPress) {
 }
 
 function pausedBanner({ frame, at }, now) {
-  const detail = `Shown is the frame of ${seconds(now - at)} ago; the skin goes on.`;
+  const detail = `The map shows the frame of ${seconds(now - at)} ago; the skin goes on.`;
   return { name: "paused", level: "info", title: "Looking back.", detail, frame };
 }
 
