@@ -65,9 +65,9 @@ def unplug_and_replug(times: int, daemon: DaemonProcess, skin: PtySkin, ears: Ea
 @pytest.mark.timeout(600)
 @pytest.mark.fault(
     "Both cables pulled and put back 100 times",
-    "frames again within 1 s; threads and descriptors as before",
-    "both pseudo-terminals closed for 0.05 to 0.5 s and made anew under the same names, at 20 dual "
-    "scans/s",
+    "frames within 1 s; threads and descriptors as before",
+    "both pseudo-terminals closed for 0.05 to 0.5 s and opened again under the same names, at "
+    "20 dual scans/s",
 )
 def test_unplugged_and_replugged(
     tared: Start, skin: PtySkin, scenes: Scenes, play: Play, listen: Listen, figure: Figure
@@ -130,9 +130,9 @@ class Corrupter:
 )
 @pytest.mark.fault(
     "{share:.0%} of all bytes corrupted, {how}",
-    "every frame comes of scans that arrived intact, voltages equal to those sent; every intact "
-    "scan is used or counted as dropped; frames of both channels within 1 s of the end",
-    "500 dual scans at 100/s, random bytes put in the place of the sent ones",
+    "frames contain only intact scans, with the voltages sent; every intact scan is used or "
+    "counted as dropped; frames of both channels within 1 s of the end",
+    "500 dual scans at 100/s, with random bytes in place of sent bytes",
 )
 def test_corrupted_bytes(
     tared: Start,
@@ -210,7 +210,7 @@ def test_corrupted_bytes(
 @pytest.mark.faults
 @pytest.mark.fault(
     "10 MB of noise on one of two ports",
-    "the other channel's frames go on; memory flat; both channels within 1 s of its end",
+    "frames of the other channel continue; memory constant; both channels within 1 s of the end",
     "random bytes as fast as they are read, the other port at 20 scans/s",
 )
 def test_a_burst_of_noise(
@@ -273,8 +273,8 @@ def twin(
 @pytest.mark.faults
 @pytest.mark.fault(
     "One channel lost for a minute",
-    "flagged, maps go on at the same rate, both channels within 1 s of its return",
-    "the twin says nothing of the structure channel for 60 s, a press of 180 kPa on it",
+    "flagged; maps continue at the same rate; both channels within 1 s of the channel's return",
+    "the twin omits the structure channel for 60 s, under a press of 180 kPa",
 )
 def test_a_channel_is_lost_for_a_minute(
     twin: Callable[[], Twin], start: Start, listen: Listen, figure: Figure
@@ -311,7 +311,7 @@ def test_a_channel_is_lost_for_a_minute(
 @pytest.mark.faults
 @pytest.mark.fault(
     "The device restarts: counter and clock at 0 again, cables pulled for a moment",
-    "told as an event; frames again within 1 s of its return, on the old reference",
+    "an event; frames within 1 s of the device's return, on the old reference",
     "the twin is stopped and a new one started under the same names",
 )
 def test_the_device_restarts(
@@ -336,8 +336,8 @@ def test_the_device_restarts(
 @pytest.mark.slow
 @pytest.mark.fault(
     "The two boards plugged into each other's place",
-    "each channel is known by what its board says of itself: frames go on without a flag",
-    "both cables pulled, put back crosswise at 20 dual scans/s",
+    "each board names its own channel: frames continue without a flag",
+    "both cables exchanged at 20 dual scans/s",
 )
 def test_the_boards_are_exchanged(
     tared: Start, skin: PtySkin, scenes: Scenes, listen: Listen, play: Play, figure: Figure
@@ -363,10 +363,10 @@ def test_the_boards_are_exchanged(
     ("what", "event"), [("nothing", "device_silent"), ("noise at 2 kB/s", "device_garbled")]
 )
 @pytest.mark.fault(
-    "A device whose port stays open but says {what} for 10 s",
-    "told as {event} after 3 s; asked again and its port opened anew meanwhile; frames within 1 s "
-    "of its speaking again",
-    "both lines, 20 dual scans/s before and after",
+    "A device whose port stays open but sends {what} for 10 s",
+    "event {event} after 3 s; the daemon asks the device again and reopens the port; frames "
+    "within 1 s of the device's return",
+    "both ports, 20 dual scans/s before and after",
 )
 def test_a_device_of_no_use(
     tared: Start,
@@ -399,9 +399,10 @@ def test_a_device_of_no_use(
 
 @pytest.mark.faults
 @pytest.mark.fault(
-    "The daemon started before its ports are there",
-    "it waits, says so, and publishes within 1.5 s of their coming, the tare included",
-    "wait_for_ports, the cables put in 3 s after it is ready, 100 dual scans/s",
+    "The daemon started before its ports exist",
+    "the daemon reports that it waits, and publishes within 1.5 s of the ports' arrival, tare "
+    "included",
+    "wait_for_ports; the cables plugged in 3 s after `ready`; 100 dual scans/s",
 )
 def test_ports_that_come_later(
     start: Start, skin: PtySkin, scenes: Scenes, listen: Listen, play: Play, figure: Figure

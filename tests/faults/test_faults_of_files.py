@@ -12,11 +12,11 @@ from hostile_files import CORPUS
 
 @pytest.mark.faults
 @pytest.mark.fault(
-    "Files that nobody means well with, read by every command that reads files",
+    "Hostile files, read by every command that reads files",
     f"no traceback, at most {MAX_MB} MB and {MAX_CPU_S:g} s of processor time, nothing written "
     "over, no pipe or device waited for, no terminal steered",
-    "packed zeros, false headers and marks, records by the million, deep nests, pipes, devices, "
-    "links to passwords, names that steer terminals; each command a process of its own",
+    "packed zeros, false headers and marks, millions of records, deep nesting, pipes, devices, "
+    "links to passwords, names with terminal commands; a process for each command",
 )
 def test_hostile_files(tmp_path: Path, figure: Callable[[str], None], scale: float) -> None:
     good, most_mb, most_s = tmp_path / "good.npz", 0.0, 0.0

@@ -53,11 +53,11 @@ def try_hostile_board(
 
 @pytest.mark.faults
 @pytest.mark.fault(
-    "A hostile board on {ports} port(s): checksums that are right, contents that are absurd",
-    "the daemon goes on; every message that it publishes keeps to STREAM.md",
-    "acts of a second: clocks, counters, rates, scales, samples, channels, sizes, versions and "
-    "types at their edges and beyond, a proper board in between; a subscriber to all kinds "
-    "holds each message against the page's tables; recording with maps",
+    "A hostile board on {ports} port(s): valid checksums, absurd contents",
+    "the daemon continues; every message conforms to STREAM.md",
+    "for a second each: clocks, counters, rates, scales, samples, channels, sizes, versions and"
+    " types at their limits and beyond, with a correct board in between; a subscriber to all "
+    "kinds compares each message with the page's tables; recording with maps",
 )
 @pytest.mark.parametrize("ports", [1, 2])
 @pytest.mark.timeout(2 * LONG_S)
@@ -137,9 +137,9 @@ def ros(stream: str, _: Path) -> Iterator[Count]:
 
 @pytest.mark.faults
 @pytest.mark.fault(
-    "A hostile board behind a door: {door.__name__}",
-    "the door goes on, and hands on what comes once the board behaves",
-    "as above for a minute; of ROS 2 what the node publishes, without ROS",
+    "A hostile board behind another program: {door.__name__}",
+    "the program continues, and passes frames on when the board behaves",
+    "as above for a minute; for ROS 2 the node's messages, without ROS",
 )
 @pytest.mark.parametrize("door", [foxglove, zenoh_bridge, ros])
 @pytest.mark.timeout(600)

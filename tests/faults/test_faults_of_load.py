@@ -42,8 +42,8 @@ def at_rest(daemon: DaemonProcess) -> dict[str, Any]:
 @pytest.mark.faults
 @pytest.mark.fault(
     "Scans at 10 times the rate that can be reconstructed",
-    "the newest wins; each dual scan is published or counted as dropped, exactly; no frame is "
-    "older than two reconstructions when it is published (p99)",
+    "the newest scan is used; each dual scan is published or counted as dropped; at "
+    "publication, no frame is older than two reconstructions (p99)",
     "two contacts that jump with each dual scan, for 15 s, at ten times the rate at which the "
     "daemon publishes when flooded",
 )
@@ -80,9 +80,9 @@ def test_ten_times_too_fast(
 @pytest.mark.faults
 @pytest.mark.fault(
     "The daemon is stopped for 5 s and continued (SIGSTOP, as a suspended virtual machine)",
-    "no frame pretends to be younger than it is by more than 0.1 s; fresh frames within 1 s",
-    "20 dual scans/s throughout, the device's clock known; each frame's date against the time at "
-    "which its scan was sent",
+    "no frame states an age that is more than 0.1 s too low; fresh frames within 1 s",
+    "20 dual scans/s throughout, the device's clock known; each frame's date compared with the "
+    "time of sending",
 )
 def test_the_daemon_is_stopped_for_a_while(
     tared: Start, scenes: Scenes, play: Play, listen: Listen, figure: Figure

@@ -56,11 +56,11 @@ def a_clients_keys(robot: Path, desk: Path) -> list[str]:
 @pytest.mark.parametrize("keys", ["without", "with"])
 @pytest.mark.fault(
     "A hostile page: a browser shows a page of another port of this computer; {keys} keys",
-    "the page reads nothing, commands nothing and presses nothing",
-    "headless Chromium; POSTs that read as ZeroMQ messages, and reach a socket without a guard, to "
-    "the daemon's stream and control socket and to the twin's; websockets to the viewer and the "
-    "Foxglove bridge; the viewer's page read. Keys are for the daemon's sockets, viewer and bridge "
-    "then have a client's; the twin takes none",
+    "the page can neither read, command nor press",
+    "headless Chromium; POSTs that parse as ZeroMQ messages, to the daemon's and the twin's "
+    "sockets; websockets to the viewer and the Foxglove bridge; a read of the viewer's page. "
+    "With keys, the daemon's sockets need keys, and viewer and bridge have a client's keys; the"
+    " twin takes none",
 )
 def test_a_hostile_page(attacker: Attacker, tmp_path: Path, figure: Figure, keys: str) -> None:
     robot, desk = tmp_path / "robot", tmp_path / "desk"

@@ -62,8 +62,8 @@ def subscriber() -> Iterator[Callable[[DaemonProcess], subprocess.Popen[str]]]:
 @pytest.mark.faults
 @pytest.mark.fault(
     "A subscriber stopped by SIGSTOP for 20 s, beside a healthy one",
-    "the healthy one's latency as before; memory bounded; the stopped one then gets current frames "
-    "and knows by `sequence` what it missed",
+    "the healthy subscriber's latency stays; memory bounded; the stopped subscriber then gets "
+    "current frames, and `sequence` shows the missed frames",
     "maps at 100/s, 3 MB/s, to two processes of the Python client",
 )
 def test_a_stopped_subscriber(
@@ -110,8 +110,8 @@ def test_a_stopped_subscriber(
 @pytest.mark.faults
 @pytest.mark.fault(
     f"{SUBSCRIBERS} subscribers",
-    "all get every frame; memory below 100 MB more",
-    "maps at 20/s to 200 sockets, 120 MB/s in all; age on arrival at the last one",
+    "all get every frame; memory grows by less than 100 MB",
+    "maps at 20/s to 200 sockets, 120 MB/s in all; age on arrival at the last socket",
 )
 def test_many_subscribers(
     tared: Start, scenes: Scenes, play: Play, listen: Listen, figure: Figure
@@ -157,7 +157,8 @@ def test_many_subscribers(
 @pytest.mark.faults
 @pytest.mark.fault(
     "A subscriber that subscribes and unsubscribes 10,000 times",
-    "frames go on for the others; memory, threads and descriptors flat; the count right afterwards",
+    "frames continue for other subscribers; memory, threads and descriptors constant; the count"
+    " is right afterwards",
     "one socket as fast as it can, then 500 connections opened and closed",
 )
 def test_a_fickle_subscriber(
@@ -217,7 +218,7 @@ def rubbish(rng: np.random.Generator) -> Iterator[list[bytes]]:
 @pytest.mark.slow
 @pytest.mark.fault(
     "The control socket and the stream fed garbage",
-    "frames go on; requests are answered; memory flat",
+    "frames continue; requests are answered; memory constant",
     "2,000 messages of random parts and random bytes to the control socket, random subscriptions "
     "to the stream, and random bytes instead of ZeroMQ to both ports",
 )

@@ -71,7 +71,7 @@ def counters(path: Path) -> set[int]:
 @pytest.mark.faults
 @pytest.mark.fault(
     "SIGKILL while recording, {loops} busy loops",
-    "the file opens again; at most the last 0.25 s are lost, nothing before",
+    "the file opens; at most the last 0.25 s are lost",
     f"{KILLS} daemons killed at a random moment, a contact that moves, 100 dual scans/s",
 )
 @pytest.mark.parametrize("loops", [0, 4])
@@ -119,8 +119,8 @@ def small_disk(tmp_path: Path, as_root: None) -> Iterator[Path]:
 @pytest.mark.faults
 @pytest.mark.fault(
     "A disk of 5 MB, full after seconds",
-    "the recording ends with an event, frames go on at the same rate, what was written opens; it "
-    "goes on by itself once there is room",
+    "the recording ends with an event, frames continue at the same rate, and the written part "
+    "opens; the recording resumes when there is room",
     "a tmpfs of 5 MB with another file of 2 MB on it, deleted later; maps recorded at 100/s",
 )
 def test_a_full_disk(
@@ -169,7 +169,7 @@ def wait_for_wall_clock(ears: Ears, ahead_s: float) -> None:
 @pytest.mark.faults
 @pytest.mark.fault(
     "The wall clock set back by a day, then forward by two",
-    "frames go on; ages, rates and latencies do not notice; the recording stays readable",
+    "frames continue; ages, rates and latencies stay right; the recording stays readable",
     "libfaketime under the daemon alone, realtime only; 50 dual scans/s",
 )
 def test_the_wall_clock_is_set(
@@ -219,7 +219,7 @@ def test_the_wall_clock_is_set(
 @pytest.mark.parametrize("when", ["once", pytest.param("always for 3 s", marks=pytest.mark.faults)])
 @pytest.mark.fault(
     "A reconstruction that raises, {when}",
-    "told as an event (at most one a second); the next dual scan that can be reconstructed is "
+    "an event (at most one a second); the next dual scan that can be reconstructed is "
     "published; nothing else stops",
     "a reconstructor that raises while a file exists, in an otherwise usual daemon",
 )
@@ -263,8 +263,8 @@ def test_a_reconstruction_that_raises(
 @pytest.mark.faults
 @pytest.mark.fault(
     "The network files vanish",
-    "while it runs: nothing changes. At a restart without them: the physics searches by itself, "
-    "and frames say so",
+    "nothing changes until a restart; then the physics searches without a network, and frames "
+    "say so",
     "all .onnx files deleted from a copy of the models' package, then the daemon restarted",
 )
 def test_the_networks_vanish(
@@ -297,8 +297,7 @@ def test_the_networks_vanish(
 @pytest.mark.faults
 @pytest.mark.fault(
     "A reconstruction that hangs for 8 s",
-    "the service manager's watchdog is fed no more, though every other thread runs; fed again when "
-    "it goes on",
+    "the watchdog is not fed although every other thread runs, and is fed again afterwards",
     "a reconstructor that hangs while a file exists, in an otherwise usual daemon; a watchdog of "
     "2 s on a socket as systemd's",
 )

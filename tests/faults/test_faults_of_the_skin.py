@@ -32,7 +32,7 @@ PALM_S, PALM_KPA, PALM_RADIUS_M = 30.0, 20.0, 0.04
 @pytest.mark.parametrize("frozen", [("magnitude",), ("structure",), ("magnitude", "structure")])
 @pytest.mark.fault(
     "A converter freezes: {frozen} repeat bit for bit while counters go on, a contact moves",
-    "told as converter_frozen; every later frame says that the channel is missing",
+    "event converter_frozen; every later frame has the flag of the missing channel",
     "20 dual scans/s for 10 s after a tare",
 )
 def test_a_frozen_converter(
@@ -72,7 +72,7 @@ def test_a_frozen_converter(
 @pytest.mark.faults
 @pytest.mark.fault(
     "Two whole skins on one daemon",
-    "the second is refused by name (device_refused); the first goes on, and its contacts show",
+    "the second skin is refused by name (device_refused); contacts of the first skin show",
     "two ports, each with both channels; the second skin pressed all the time, 20 dual scans/s",
 )
 def test_two_skins_on_one_daemon(
@@ -110,8 +110,8 @@ def test_two_skins_on_one_daemon(
 @pytest.mark.faults
 @pytest.mark.fault(
     "A tare under a press",
-    "reference_disputed until the skin is at rest, and then as before it",
-    "a contact of 180 kPa that is held, tared and let go, 20 dual scans/s",
+    "reference_disputed until the skin is at rest; then the reference before the tare",
+    "a contact of 180 kPa is held, tared and released, 20 dual scans/s",
 )
 def test_a_tare_under_a_press(
     tared: Start, scenes: Scenes, play: Play, listen: Listen, figure: Figure
@@ -139,8 +139,8 @@ def test_a_tare_under_a_press(
 @pytest.mark.faults
 @pytest.mark.measure(
     "A palm that comes lightly: a pad of 80 mm to 20 kPa within 30 s",
-    "none; told as it is",
-    "its pressure rises evenly, 20 dual scans/s; frames by how many contacts they show",
+    "no promise",
+    "the pressure rises evenly, 20 dual scans/s; frames counted by their number of contacts",
 )
 def test_a_palm_that_comes_lightly(
     tared: Start,

@@ -49,9 +49,8 @@ def memory_mb(pid: int) -> float:
 @pytest.mark.measure(
     "Ten skins of one robot, 20/s each; a contact slides on {touched} of them",
     "every scan is counted",
-    "one `tactomo daemon` of ten skins for 60 s (times `--scale`), a subscriber to each; what "
-    "slides does so at 10 cm/s; processor time by the kernel's account, memory with what is shared "
-    "counted once",
+    "one `tactomo daemon` of ten skins for 60 s × `--scale`, a subscriber to each; shared "
+    "memory counted once",
 )
 def test_ten_skins(
     robot: Robot, scenes: Scenes, figure: Figure, scale: float, touched: int
