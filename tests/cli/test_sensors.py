@@ -73,7 +73,7 @@ def test_several_are_listed_and_one_is_asked_for(tactomo: Run, monkeypatch: Any)
             told = tactomo("tare")
             assert told.returncode == 1
             assert "left at tcp://127.0.0.1:1, of /dev/ttyACM0\n" in told.stderr
-            assert "2 run on this computer; say which by --sensor NAME:\n" in told.stderr
+            assert "2 run on this computer; choose one by --sensor NAME:\n" in told.stderr
             monkeypatch.setenv("TACTOMO_SENSOR", "left")
             assert tactomo("tare").returncode == 0
     assert right.requests == []

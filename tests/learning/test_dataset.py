@@ -106,7 +106,7 @@ def test_steps_of_a_robot_have_what_it_could_have_known(tactomo: Run, tmp_path: 
     result = tactomo("export", "grasp.mcap", "set", "--lerobot", "--robot", "steps.csv")
     assert result.returncode == 0, result.stderr
     assert "2 steps are missing in the robot's log at 30 a second" in result.stderr
-    assert "steps show the frame of the step before once more" in result.stderr
+    assert "steps repeat the frame of the step before" in result.stderr
     assert "1 steps have no frame younger than 0.5 s" in result.stderr  # the very first
     dataset = opened(tmp_path / "set")
     assert (dataset.num_frames, dataset.num_episodes, dataset.fps) == (98, 2, 30)

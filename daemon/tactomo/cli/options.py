@@ -84,13 +84,15 @@ def _known_methods(context: typer.Context, names: list[str] | None) -> list[str]
 
 def method_option(default: str = "") -> Any:
     """Return the option --method; `default` says what happens without the option."""
-    words = f"How to reconstruct: a name, or your own my_module:MyMethod.{default}"
+    words = f"Reconstruction method: a name, or your own my_module:MyMethod.{default}"
     return typer.Option("--method", help=words, autocompletion=method_names, callback=_known_method)
 
 
 def methods_option(default: str, **settings: Any) -> Any:
     """Return the option --method of a command that sets methods beside each other."""
-    words = f"How to reconstruct: a name, or your own my_module:MyMethod; may be repeated.{default}"
+    words = (
+        f"Reconstruction method: a name, or your own my_module:MyMethod; may be repeated.{default}"
+    )
     return typer.Option(
         "--method", help=words, autocompletion=method_names, callback=_known_methods, **settings
     )
@@ -104,7 +106,7 @@ def _importable_protocol(name: str | None) -> str | None:
 
 
 def _protocol(default: str = "") -> Any:
-    words = f"What the device speaks: a name, or your own my_module:MyProtocol.{default}"
+    words = f"Protocol of the device: a name, or your own my_module:MyProtocol.{default}"
     return typer.Option(
         "--protocol", help=words, autocompletion=_protocol_names, callback=_importable_protocol
     )

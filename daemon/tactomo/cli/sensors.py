@@ -139,11 +139,12 @@ def _status_of(name: str | None, address: str, keys: Path | None) -> Mapping[str
     if not statuses:
         raise SensorError(
             f"no daemon answers at {address}" + ("" if name is None else f" for a sensor {name!r}"),
-            "is it running, and is this its stream? `tactomo status` shows those of this computer",
+            "does the daemon run, and is this its stream? `tactomo status` lists the daemons of "
+            "this computer",
         )
     if len(statuses) > 1:
         raise SensorError(
-            f"{address} carries {', '.join(sorted(statuses))}", "say which by --sensor NAME"
+            f"{address} carries {', '.join(sorted(statuses))}", "choose one by --sensor NAME"
         )
     return next(iter(statuses.values()))
 

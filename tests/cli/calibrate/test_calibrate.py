@@ -330,7 +330,7 @@ def test_a_session_keeps_what_was_taken_and_goes_on(pressed: Pressed) -> None:
         terminal.wait_for("curve: ±")
         assert "contradict" not in terminal.shown
         take(terminal, pressed, 9, 1.9, 0.15)  # for 195
-        terminal.wait_for("The others contradict that reading: undo drops it")
+        terminal.wait_for("The other readings contradict this reading: undo drops it")
         terminal.wait_for("Reading 10")
         terminal.enter("undo")
         terminal.wait_for("dropped the reading at 2 kPa")

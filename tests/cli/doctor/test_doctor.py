@@ -95,7 +95,7 @@ def test_a_table_names_the_electrode(
     steps = [finding["next_step"] for finding in told if finding["next_step"]]
     assert steps
     assert all(f" {step}\n" in outcome.stdout for step in steps)  # whole: to be copied
-    assert "ill: see what is marked" in outcome.stdout
+    assert "ill: follow the next steps" in outcome.stdout
 
 
 def every_pair(electrodes: int, volts: FloatArray) -> FloatArray:

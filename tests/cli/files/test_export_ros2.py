@@ -174,7 +174,7 @@ def test_a_clock_that_jumps_and_lost_frames_are_named(tactomo: Run, tmp_path: Pa
         "1 steps of the wall clock, the first by -3600.000 s",
         "1 restarts of the daemon",
         "5 frames have no map",
-        "2 frames do not tell whether anything presses: misfit_high 2",
+        "2 frames where a press may be missing: misfit_high 2",
     ):
         assert line in result.stderr
     assert f"{len(numbers)} frames" in result.stdout

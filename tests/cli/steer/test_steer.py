@@ -313,4 +313,4 @@ def test_poke_tells_that_there_is_nothing_to_release(tactomo: Run, control: Any)
     control.answers["release"] = {"released": False}
     result = tactomo(*command)
     assert (result.returncode, result.stdout) == (1, "")
-    assert "nothing of this id presses" in result.stderr
+    assert "no press has this id" in result.stderr

@@ -84,7 +84,9 @@ def bench(
     description: options.Description = options.DEFAULT_DESCRIPTION,
     seconds: Annotated[
         float,
-        typer.Option(min=1.0, rich_help_panel=LIVE, help="Time of each of the four live scenes."),
+        typer.Option(
+            min=1.0, rich_help_panel=LIVE, help="Seconds of each of the four live scenes."
+        ),
     ] = STATUS_S,
     ports: Annotated[
         int | None,
@@ -145,7 +147,7 @@ def bench(
     if show and not machine_speed:
         raise typer.BadParameter("--show goes with --machine-speed")
     if machine_speed and chart is not None:
-        raise typer.BadParameter("--machine-speed and --chart are two runs")
+        raise typer.BadParameter("use --machine-speed and --chart in separate runs")
     if method and chart is None:
         raise typer.BadParameter("--method goes with --chart")
     results = Results(machine(), description)

@@ -109,7 +109,10 @@ def warned_if_busy() -> Iterator[list[str]]:
     yield warnings
     share = (time.process_time() - own_s) / (time.perf_counter() - wall_s)
     if share < BUSY:
-        busy = f"the machine was busy: this had {share:.0%} of a core, and its times are too long"
+        busy = (
+            f"the machine was busy: this process had {share:.0%} of a core, so its times are "
+            "too long"
+        )
         warnings.append(busy)
         say(f"{busy}; run it again when nothing else runs", err=True)
 

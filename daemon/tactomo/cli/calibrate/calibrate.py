@@ -66,7 +66,7 @@ def live(
     diameter_mm: DiameterMm = None,
     area_mm2: AreaMm2 = None,
     fresh: Annotated[
-        bool, typer.Option("--fresh", help="Begin anew, not with what was taken.")
+        bool, typer.Option("--fresh", help="Begin anew, without earlier readings.")
     ] = False,
     output: Output = None,
     address: options.Address = None,
@@ -155,8 +155,8 @@ def fit(
 
         # One slip moves the whole curve, and a running robot would go by it at once.
         raise CalibrationError(
-            f"nothing is kept, as lines of {readings} disagree: {'; '.join(odd)}. Correct them, or "
-            "leave them out, and run this again; or keep it as it is by --keep-odd"
+            f"nothing is kept, as lines of {readings} disagree: {'; '.join(odd)}. Correct "
+            "or leave out these lines and run the command again; or pass --keep-odd"
         )
 
 
@@ -214,7 +214,7 @@ def _area_mm2(diameter_mm: float | None, area_mm2: float | None) -> float | None
     if diameter_mm is None:
         return area_mm2
     if area_mm2 is not None:
-        raise typer.BadParameter("--diameter-mm and --area-mm2: give one of them")
+        raise typer.BadParameter("give either --diameter-mm or --area-mm2")
     return math.pi / 4 * diameter_mm**2
 
 
@@ -251,7 +251,7 @@ def _facts(made: PressureCalibration) -> list[str]:
     onset = made.onset_kpa
     hysteresis = made.hysteresis_kpa
     return [
-        "onset not seen: the lightest reading is answered to"
+        "onset not measured: the lightest reading already shows a response"
         if onset is None
         else f"answers from {onset:.0f} kPa",
         f"readings scatter by {made.repeatability_kpa:.1f} kPa beyond their own uncertainty",
@@ -266,5 +266,5 @@ def _beyond(made: PressureCalibration) -> str:
     low, high = made.curve.range_kpa
     return (
         f"Below {low:.0f} kPa contacts are `below` (touched, pressure unknown); beyond {high:.0f} "
-        "kPa they are `above` (at least what is told)."
+        "kPa they are `above` (a lower bound)."
     )

@@ -112,7 +112,7 @@ def seen_of(frames: Sequence[tuple[float, Frame]]) -> load_cell.Seen:
     trusted = [(time_s, frame) for time_s, frame in frames if not distrusted(frame)]
     if not trusted:
         raise CalibrationError(
-            f"none of the {len(frames)} frames can be trusted; `tactomo doctor` tells why"
+            f"none of the {len(frames)} frames can be trusted; `tactomo doctor` says why"
         )
     single = [frame.contacts[0] if len(frame.contacts) == 1 else None for _, frame in trusted]
     return load_cell.Seen(

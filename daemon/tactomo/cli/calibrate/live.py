@@ -101,7 +101,7 @@ def _subject(status: Status) -> Subject:
     if description is None or "magnitude" not in description.modalities:
         raise TactomoError(
             f"{status.sensor} has no magnitude channel",
-            "its structure channel tells where it is touched, and never how hard",
+            "its structure channel shows places, but no pressure",
         )
     devices = {port.device.device_id for port in status.ports if port.device is not None}
     return Subject(
@@ -159,9 +159,9 @@ class _Session:
         say(f"Calibrating {self._view.sensor} against a load cell.")
         say(
             "Press with one flat indenter, well inside the skin, and go from load to load without "
-            "lifting it.\nAt each: hold still, press Enter, and type what the load cell says in "
-            "newtons. undo drops\nthe last reading, done or Ctrl-C ends. What "
-            "was taken is kept at once."
+            "lifting it.\nAt each: hold still, press Enter, and type the load cell's reading in "
+            "newtons. undo drops\nthe last reading, done or Ctrl-C ends. Each "
+            "reading is kept at once."
         )
         if self._area_mm2 is None:
             diameter_mm = self._asked("Diameter of the indenter in mm: ", least=1.0, most=1e3)
@@ -234,7 +234,7 @@ class _Session:
     def _why_not(self, frames: Sequence[Frame]) -> str:
         """Why these frames are no reading; empty where they are one."""
         if self._view.is_gone or (frames and frames[-1].is_stale):
-            return "no data come: is the daemon running, and the skin plugged in?"
+            return "no data: does the daemon run, and is the skin plugged in?"
         if not frames:
             return "waiting for a frame"
         flags = distrusted(frames[-1])
@@ -288,14 +288,16 @@ class _Session:
         fit = _fit_so_far(self.readings)
         wanted = still_wanted(self.readings)
         if len(self.readings) - 1 in find_outliers(self.readings):
-            self._console.print("The others contradict that reading: undo drops it.", style="red")
+            self._console.print(
+                "The other readings contradict this reading: undo drops it.", style="red"
+            )
         if fit is not None:
             sigma_kpa = statistics.median(fit.curve.sigma_kpa.tolist())
             self._console.print(f"curve: ± {sigma_kpa:.1f} kPa (median of the range)")
         self._console.print(
             f"Still wanted: {'; '.join(wanted)}."
             if wanted
-            else "That is enough: type done, or go on for a better one."
+            else "That is enough: type done, or continue for a better curve."
         )
 
 

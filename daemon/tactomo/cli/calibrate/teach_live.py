@@ -103,7 +103,7 @@ class _Session:
             heard = self._heard(REST_S)
             if not heard.pressed:
                 break
-            self._console.print("something presses; `tactomo tare` if nothing does")
+            self._console.print("something presses; if nothing does, run `tactomo tare`")
         if not isinstance(heard.layout, SensorDescription):
             raise TactomoError(
                 "the daemon's sensor description is not on this computer", "give --description"
@@ -152,16 +152,16 @@ class _Session:
         if flags:
             return f"not to be trusted: {', '.join(flags)}; `tactomo tare` unpressed"
         if heard.pressed < heard.frames or not heard.frames:
-            return "no contact was seen all the while: press, then Enter, and hold for a second"
+            return "no contact was seen: press, then Enter, and hold for a second"
         for name, scans in heard.scans.items():
             if f"{name}_reference" not in self._arrays:
-                return f"the {name} channel was missing when the skin was taken at rest; begin anew"
+                return f"the {name} channel was missing in the scans at rest; begin anew"
             before, after = np.array_split(scans, 2)
             change = np.linalg.norm(scans.mean(axis=0) - self._arrays[f"{name}_reference"])
             moved = np.linalg.norm(after.mean(axis=0) - before.mean(axis=0))
             noise = np.sqrt(2 * before.var(axis=0).sum() / max(len(before) - 1, 1))
             if moved > STILL_SHARE * change + 2 * noise:
-                return "it moved: hold it still for a second"
+                return "the contact moved: hold it still for a second"
         return ""
 
     def _keep(self, which: slice, press: dict[str, FloatArray] | None = None) -> None:

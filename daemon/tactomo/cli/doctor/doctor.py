@@ -58,7 +58,7 @@ def doctor(
     sensor: options.Sensor = None,
     address: options.Address = None,
     seconds: Annotated[
-        float, typer.Option(min=1.0, help="How long to listen to the daemon.")
+        float, typer.Option(min=1.0, help="Seconds of listening to the daemon.")
     ] = 10.0,
     description: Annotated[
         str | None,
@@ -78,7 +78,7 @@ def doctor(
     ] = None,
     pattern: Annotated[
         str | None,
-        typer.Option(help="Of what a file's numbers are: 16:adjacent. [the one that fits]"),
+        typer.Option(help="Pattern of a file's voltages: 16:adjacent. [the one that fits]"),
     ] = None,
     as_json: options.JsonOutput = False,
     keys: options.KeysFolder = None,
@@ -227,8 +227,8 @@ def _print(
 def _why(verdict: Level) -> str:
     return {
         "advice": ", with some advice",
-        "fault": ": see what is marked ✗, and what to do about it",
-        "broken": ": nothing that comes from this device can be trusted",
+        "fault": ": follow the next steps of the lines marked ✗",
+        "broken": ": no reading of this device can be trusted",
         "unknown": ": too little is known",
     }[verdict]
 

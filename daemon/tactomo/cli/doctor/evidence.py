@@ -142,7 +142,7 @@ class _Listener:
         if not self.said["status"]:
             raise DoctorError(
                 f"no daemon answers at {self._where}",
-                "`tactomo status` says how it is",
+                "`tactomo status` shows its state",
             )
         status = self.said["status"][-1]
         self.said = {kind: [] for kind in self.said} | {"status": [status]}
@@ -275,7 +275,7 @@ def of_recording(recording: Recording, description: str | None, frames: slice | 
     evidence = Evidence(str(recording.path), known, scans, times_s, saturated)
     evidence.heard = _heard_on_ports(recording, ports)
     if not recording.summary.is_complete:
-        evidence.notes = ("the recording was cut off: what is there was read",)
+        evidence.notes = ("the recording was cut off: the rest was read",)
     return evidence
 
 

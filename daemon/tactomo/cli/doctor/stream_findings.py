@@ -66,7 +66,7 @@ def _lost_found(evidence: Evidence, lost: int) -> Finding:
         "lost_scans",
         Level.FAULT if is_fault else Level.ADVICE,
         f"{lost} of {count + lost} dual scans ({share:.1%}) did not arrive",
-        "the computer is busy: look again when it is not"
+        "the computer is busy: repeat when the computer is idle"
         if is_busy
         else "is the line too slow for the rate, or the computer too busy?",
         figures,

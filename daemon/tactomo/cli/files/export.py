@@ -76,18 +76,16 @@ def export(
     fps: Annotated[
         int | None, typer.Option(min=1, help="For --lerobot: steps a second. [the robot's, or 30]")
     ] = None,
-    task: Annotated[str, typer.Option(help="For --lerobot: what is done, in words.")] = "touch",
+    task: Annotated[str, typer.Option(help="For --lerobot: the task, in words.")] = "touch",
     start_s: FromOption = 0.0,
     end_s: ToOption = None,
     description: RecordedDescription = None,
     layout: Annotated[
-        Path | None, typer.Option(help="For .mcap: write the layout, too, to import in Foxglove.")
+        Path | None, typer.Option(help="For .mcap: also write a layout to import in Foxglove.")
     ] = None,
     parent: Annotated[
         str | None,
-        typer.Option(
-            help="For .mcap and --ros2: frame that the sensor hangs on. [world; a bag: not told]"
-        ),
+        typer.Option(help="For .mcap and --ros2: parent frame of the sensor. [world; a bag: none]"),
     ] = None,
     pose: Pose = "0,0,0",
     force: Force = False,
@@ -220,7 +218,7 @@ def _prepare_folder(output: Path) -> None:
 def _checked(count: int) -> int:
     if not count:
         raise TactomoError(
-            "there are no frames between these times", "`tactomo info` tells how long it is"
+            "there are no frames between these times", "`tactomo info` shows its length"
         )
     return count
 

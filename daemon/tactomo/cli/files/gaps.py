@@ -41,7 +41,7 @@ class Gaps:
             "back": "frames are not later than the one before",
             "restart": "restarts of the daemon: contact identities begin anew",
             "no map": "frames have no map",
-            "unknown": f"frames do not tell whether anything presses: {flags or 'stale'}",
+            "unknown": f"frames where a press may be missing: {flags or 'stale'}",
         }
         return [
             f"{self._counts[what]} {sentence} (the first at {self._first_s[what]:.3f} s)"

@@ -74,8 +74,8 @@ class Alignment:
         """Return what did not fit, a sentence each."""
         sentences = {
             f"steps have no frame younger than {STALE_S:g} s: zeros, `has_frame` 0": self._without,
-            "steps show the frame of the step before once more": self._repeated,
-            "frames are in no step: newer ones had come": self._passed_over,
+            "steps repeat the frame of the step before": self._repeated,
+            "frames are in no step, because newer frames replaced them": self._passed_over,
         }
         return [f"{count} {sentence}" for sentence, count in sentences.items() if count]
 

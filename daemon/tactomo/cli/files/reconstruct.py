@@ -48,7 +48,8 @@ def reconstruct(
         ),
     ] = None,
     taught: Annotated[
-        Path | None, typer.Option(help="By `tactomo teach`: corrects where single contacts are.")
+        Path | None,
+        typer.Option(help="Model of `tactomo teach`: corrects places of single contacts."),
     ] = None,
     rest: Annotated[
         Path | None, typer.Option("--reference", help="File of scans of the unpressed sensor.")
@@ -56,7 +57,7 @@ def reconstruct(
     reference_frames: ReferenceFrames = None,
     pattern: Annotated[
         str | None,
-        typer.Option(help="Of what IN's numbers are, see below. [the description's pattern]"),
+        typer.Option(help="Pattern of IN's voltages, see above. [the description's pattern]"),
     ] = None,
     array: Annotated[
         str | None, typer.Option(help="Name of the array of scans in IN. [the one that fits]")

@@ -89,7 +89,7 @@ def read_robot_log(path: Path) -> RobotLog:
     if len(back):
         raise TactomoError(
             f"{path}, line {back[0] + 3}: {clock} is not later than in the line before",
-            "give the steps in the order of their times; monotonic_s is set by nobody",
+            "give the steps in the order of their times; monotonic_s never jumps",
         )
     rest = [i for i, name in enumerate(names) if name not in (*CLOCKS, EPISODE)]
     return RobotLog(clock, times_s, episodes, tuple(names[i] for i in rest), rows[:, rest])

@@ -75,7 +75,7 @@ def copy(
     from tactomo.errors import TactomoError, os_errors_as
 
     text = shipped_text(name)
-    step = "give the path of a file that is not there"
+    step = "give the path of a new file"
     with (
         os_errors_as(TactomoError, f"cannot write {path}", step),
         path.open("x", encoding="utf-8") as file,

@@ -69,7 +69,7 @@ def plot(
         if not course.times_s:
             raise TactomoError(
                 f"there are no frames of {recording} between these times",
-                "`tactomo info` tells how long it is",
+                "`tactomo info` shows its length",
             )
         maps = read_maps(frames, course) if "maps" in panels else []
         figure = draw_page(course, maps, frames.description, panels, recording.name)

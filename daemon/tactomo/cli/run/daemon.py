@@ -32,7 +32,7 @@ app = options.typer_app()
 )
 def daemon(
     config: Annotated[
-        Path | None, typer.Argument(help="Configuration (TOML); options win over it.")
+        Path | None, typer.Argument(help="Configuration (TOML); options override its keys.")
     ] = None,
     sensor: Annotated[
         str | None, typer.Option("--sensor", "-s", help="The sensor's name in the stream. [skin]")
@@ -123,7 +123,7 @@ def replay(
         str, typer.Option(help="Factor of the recorded speed, or max: as fast as reconstructed.")
     ] = "1.0",
     with_viewer: Annotated[
-        bool, typer.Option("--viewer", help="Serve the viewer, too, and stay at the end.")
+        bool, typer.Option("--viewer", help="Also serve the page, and stay at the end.")
     ] = False,
     sensor: Annotated[
         str | None, typer.Option("--sensor", "-s", help="Name in the stream. [the recorded one]")

@@ -67,7 +67,7 @@ def demo(
         bool, typer.Option("--no-browser", help="Do not open the page, where there is a desktop.")
     ] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Show what the three programs log.")
+        bool, typer.Option("--verbose", "-v", help="Show the logs of the three programs.")
     ] = False,
     announce: options.Announce = False,
 ) -> None:

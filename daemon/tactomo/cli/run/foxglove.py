@@ -37,7 +37,7 @@ def foxglove(
     ] = None,
     address: options.Address = None,
     host: Annotated[
-        str, typer.Option(help="Address to listen on; any but a loopback one lets others look.")
+        str, typer.Option(help="Address to listen on; beyond loopback, other computers can look.")
     ] = "127.0.0.1",
     foxglove_port: Annotated[
         int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes a free one.")
@@ -46,13 +46,13 @@ def foxglove(
         Path | None,
         typer.Option(help="Write the layout of the (first) sensor here, to import in Foxglove."),
     ] = None,
-    parent: Annotated[str, typer.Option(help="Frame that the sensor hangs on.")] = "world",
+    parent: Annotated[str, typer.Option(help="Parent frame of the sensor.")] = "world",
     pose: options.Pose = "0,0,0",
     allow_origin: Annotated[
         list[str] | None,
         typer.Option(
             metavar="URL",
-            help="A web page's origin that may look, too, such as http://localhost:8080; several.",
+            help="Origin of another allowed web page, such as http://localhost:8080; repeat.",
         ),
     ] = None,
     keys: options.KeysFolder = None,

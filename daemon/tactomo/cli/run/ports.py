@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from tactomo.acquisition.identify import Answer
 
 NONE_THERE = """no USB adapter is there
-  Plug the skin in and look again. If it still does not show: another cable (some only charge),
-  another socket, and `sudo dmesg | tail`, which tells what the computer saw.
+  Plug the skin in and repeat. If it is still missing, try another cable (some only charge),
+  another socket, and `sudo dmesg | tail`, which shows what the computer detected.
   No skin at hand? `tactomo twin --link /tmp/skin` simulates one."""
 
 app = typer_app()
@@ -40,15 +40,13 @@ def ports(
         bool,
         typer.Option(
             "--ask",
-            help="Open each and ask who is there; built-in ports only if they are given. Sends a "
+            help="Open each port and ask for the device; built-in ports only if given. Sends a "
             "few bytes, and resets some boards.",
         ),
     ] = False,
     protocol: Annotated[
         str | None,
-        typer.Option(
-            metavar="my_module:MyProtocol", help="A protocol of your own, to be recognised, too."
-        ),
+        typer.Option(metavar="my_module:MyProtocol", help="A protocol of your own to recognise."),
     ] = None,
     baud: Annotated[
         int | None, typer.Option(min=1200, help="Baud rate; USB takes any. [the protocol's usual]")
@@ -180,7 +178,7 @@ def _remarks(
             "may mean either, one by path means the socket; `device_ids` tells the skins apart"
         )
     if adapter.is_usb and not use:
-        remarks.append("has no lasting name: does udev run, and see this /dev?")
+        remarks.append("has no permanent name: does udev run, and see this /dev?")
     if has_modem_manager and adapter.is_usb and not adapter.is_kept_from_modem_manager:
         remarks.append(
             "ModemManager runs and may talk to it when it is plugged in: install tactomo's udev "

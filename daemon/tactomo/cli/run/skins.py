@@ -146,8 +146,8 @@ class SkinProcesses:
                     "skin_ended",
                     sensor=process.name,
                     exit_status=status,
-                    next_step="the lines before say why; "
-                    f"started again in {RESTART_S:g} s, unless no skin ever got ready",
+                    next_step="the lines above say why; "
+                    f"the daemon starts again in {RESTART_S:g} s, unless no skin was ever ready",
                 )
         elif process.is_ready and now_s - process.fed_s > WATCHDOG_S:
             log.error("skin_hangs", sensor=process.name, watchdog_s=WATCHDOG_S)

@@ -31,7 +31,7 @@ def zenoh(
     ] = None,
     bind: Annotated[
         str | None,
-        typer.Option(help="Where to serve what Zenoh has to clients of ZeroMQ on this computer."),
+        typer.Option(help="Address for ZeroMQ clients on this computer."),
     ] = None,
     robot: Annotated[
         str | None,
@@ -47,7 +47,9 @@ def zenoh(
         ),
     ] = None,
     keys: KeysFolder = None,
-    log_level: Annotated[LogLevel, typer.Option(help="The least severe that is logged.")] = "info",
+    log_level: Annotated[
+        LogLevel, typer.Option(help="Lowest severity of logged messages.")
+    ] = "info",
     log_format: Annotated[
         LogFormat,
         typer.Option(
@@ -64,7 +66,7 @@ def zenoh(
     Needs eclipse-zenoh: `pip install 'tactomo[zenoh]'`.
     """
     if bool(sources) == bool(bind):
-        raise typer.BadParameter("give --from or --bind, one of the two")
+        raise typer.BadParameter("give either --from or --bind")
     with needs("Zenoh", "pip install 'tactomo[zenoh]'"):
         from tactomo.stream.zenoh_bridge import ZenohBridge
         from tactomo.stream.zenoh_proxy import ZenohProxy

@@ -48,7 +48,7 @@ def install(
     dry_run: DryRun = False,
     root: Root = Path("/"),
     program: Annotated[
-        str | None, typer.Option(help="`tactomo` on the robot. [the one that runs now]")
+        str | None, typer.Option(help="Path of `tactomo` on the robot. [this one]")
     ] = None,
 ) -> None:
     """Install, enable and start the service of one skin: `tactomo@NAME`.
@@ -68,7 +68,7 @@ def install(
     plan = plan_install(name, names, rules, root, program or _program(dry_run))
     _carry_out(plan, dry_run)
     if not dry_run:
-        say(f"tactomo@{name} is installed; `systemctl status tactomo@{name}` shows how it is")
+        say(f"tactomo@{name} is installed; `systemctl status tactomo@{name}` shows its state")
 
 
 @app.command(
@@ -78,7 +78,7 @@ def install(
 )
 def uninstall(
     name: Annotated[
-        str | None, typer.Argument(help="The skin's name. [all, and what they share]")
+        str | None, typer.Argument(help="The skin's name. [all skins and shared files]")
     ] = None,
     dry_run: DryRun = False,
     root: Root = Path("/"),
@@ -135,7 +135,9 @@ def _carry_out(plan: Plan, dry_run: bool) -> None:
     if plan.root == Path("/"):
         check_running_systemd()
         if os.geteuid() != 0:
-            raise ServiceError("only root may do that", "run it with sudo, or look with --dry-run")
+            raise ServiceError(
+                "only root may do this", "run it with sudo, or see the steps with --dry-run"
+            )
     plan.carry_out()
 
 

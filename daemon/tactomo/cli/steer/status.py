@@ -168,7 +168,7 @@ def _budget(budget_ms: float | None, plan: dict[str, Any]) -> str:
     """Say what time a frame may take, and what it is given for that."""
     source = f"machine speed: {plan.get('source', '-')}"
     share = plan.get("share", 1.0)
-    left = f", {share:.0%} of it while others take the processor" if share < 1 else ""
+    left = f", {share:.0%} of it while other programs use the processor" if share < 1 else ""
     time = "the method's own" if budget_ms is None else f"{budget_ms:g} ms"
     if budget_ms is None and not left:
         return f"{time}; {source}"

@@ -40,7 +40,7 @@ def tare(
     with Daemon(find_control(sensor, address, keys), keys=keys) as daemon:
         needs_s = _tare_s(daemon.request("status"))
         if needs_s > SOON_S:
-            say(f"leave the skin alone: its scans take {needs_s:.0f} s to come", err=True)
+            say(f"leave the skin alone: the scans take {needs_s:.0f} s to come", err=True)
         taken = daemon.tare(TARE_TIMEOUT_S + 2 * needs_s)
     say(f"new reference from {taken.scans} dual scans")
     if taken.contacts:
@@ -154,7 +154,7 @@ def method(
     )
 )
 def poke(
-    command: Annotated[str, typer.Argument(help="A command of the twin, see below.")],
+    command: Annotated[str, typer.Argument(help="A command of the twin, see above.")],
     arguments: Annotated[
         list[str] | None, typer.Argument(metavar="[NAME=VALUE]...", help="The command's arguments.")
     ] = None,
@@ -177,7 +177,7 @@ def poke(
     named = dict(_named(argument) for argument in arguments or [])
     answer = request(command, find_twin(address), **named)
     if answer.get("released") is False:
-        raise TactomoError("nothing of this id presses", "`tactomo poke scene` lists what does")
+        raise TactomoError("no press has this id", "`tactomo poke scene` lists the presses")
     if answer:
         print_json(answer)
 
