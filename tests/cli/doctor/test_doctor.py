@@ -118,7 +118,7 @@ def test_voltages_in_no_order_are_a_broken_device(tactomo: Run, rest: FloatArray
     np.savez("in.npz", mine=noisy(mixed))
     outcome = tactomo("doctor", "in.npz", "--array", "mine")
     assert outcome.returncode == 1
-    assert "broken: nothing" in outcome.stdout
+    assert "broken: no reading" in outcome.stdout
 
 
 def test_a_pattern_says_the_order(tactomo: Run, rest: FloatArray) -> None:

@@ -111,7 +111,7 @@ def test_a_full_disk_is_recorded_to_again_once_it_has_room(
     step_until(b, lambda: told(b, "recording_failed"))
     failed = told(b, "recording_failed")[0]
     assert failed["severity"] == "error"
-    assert "tried again" in failed["next_step"]
+    assert "tries again" in failed["next_step"]
     status = b.ask("status")
     assert status["recording"] is None
     assert status["recorder"]["failures"] == 1

@@ -392,7 +392,7 @@ def test_a_list_that_cannot_be_read_lets_nobody_in(guarded: Any, robot: Robot) -
 def test_a_secret_that_others_may_read_is_refused(robot: Robot, mode: int) -> None:
     secret = key_files.secret_path(robot.folder, SERVER)
     secret.chmod(mode)
-    with pytest.raises(KeysError, match="others than its owner") as caught:
+    with pytest.raises(KeysError, match="other than the owner") as caught:
         Daemon(load_config(ports=["/dev/null"], **robot.config))
     assert f"chmod 600 {secret}" in caught.value.next_step
 

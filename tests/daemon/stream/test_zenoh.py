@@ -535,8 +535,8 @@ def test_the_pages_program_prints_touches_and_who_is_there(
 @pytest.mark.parametrize(
     ("arguments", "status", "said"),
     [
-        ([], 2, "give --from or --bind"),
-        (["--from", "ipc:///tmp/a", "--bind", "ipc:///tmp/b"], 2, "one of the two"),
+        ([], 2, "give either --from or --bind"),
+        (["--from", "ipc:///tmp/a", "--bind", "ipc:///tmp/b"], 2, "give either --from or --bind"),
         (["--from", "ipc:///tmp/none", "--robot", "a/b"], 2, "'a/b' is not a sensor name"),
         (
             ["--config", "LOCAL", "--from", "ipc:///tmp/a", "--from", "x"],
