@@ -84,7 +84,7 @@ def test_two_of_a_name_are_told_by_their_addresses(tactomo: Run) -> None:
     with announcing(*each):
         told = tactomo("watch", "--sensor", "skin")
     assert told.returncode == 1
-    assert "say which by --address ADDRESS" in told.stderr
+    assert "choose one by --address ADDRESS" in told.stderr
 
 
 @pytest.mark.parametrize(

@@ -122,7 +122,7 @@ def _several(there: list[tuple[str, str, str]]) -> SensorError:
     listed = "".join(f"\n  {name} at {at}, of {ports}" for name, at, ports in there)
     names = {name for name, _, _ in there}
     by = "--sensor NAME" if len(names) == len(there) else "--address ADDRESS"
-    return SensorError(f"{len(there)} run on this computer", f"say which by {by}:{listed}")
+    return SensorError(f"{len(there)} run on this computer", f"choose one by {by}:{listed}")
 
 
 def _heard_of(name: str | None, address: str, keys: Path | None) -> Running:
