@@ -11,9 +11,9 @@ counted in modelled work, so that a recording reconstructs exactly as the live s
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from tactomo_protocol import Channel
@@ -25,11 +25,13 @@ from tactomo_models.methods.magnitudes import BAD_MISFIT
 from tactomo_models.methods.method import Estimate, Method, Skin, UnsolvableError
 from tactomo_models.methods.registry import check_method, make_method
 from tactomo_models.physics.artifact import Artifact
+from tactomo_models.scans.changes import Changes
 from tactomo_models.scans.companion_forces import CompanionReading
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scans.repeats import Repeats
+from tactomo_models.scans.stillness import are_still
 from tactomo_models.scans.tare import Tare
 from tactomo_models.scene.areas import Areas
 from tactomo_models.scene.contacts import contacts_of, mounted, pressure_map, total_force
@@ -91,6 +93,7 @@ class Reconstructor:
         self._methods: dict[str, Method] = {}  # by their names, once they were asked for
         self._failures: dict[str, str] = {}  # of methods prepared since the tare; empty if good
         self._previous: Estimate | None = None
+        self._still: _Still | None = None  # since when the sheets have not moved
         self._tracker = ContactTracker()
         self._ranges: dict[int, tuple[PressureRange, float]] = {}  # and magnitude, of each identity
         self._name = method if isinstance(method, str) else type(method).__name__
@@ -181,6 +184,7 @@ class Reconstructor:
     def forget_shape(self) -> None:
         """Forget the warm start; contacts keep their identities."""
         self._previous = None
+        self._still = None
 
     def reconstruct(
         self,
@@ -220,7 +224,29 @@ class Reconstructor:
                 self._prepare()
         magnitude = self._measured(Channel.MAGNITUDE, magnitude)
         structure = self._measured(Channel.STRUCTURE, structure)
-        return self._tare.changes(magnitude, structure, saturated, companions)
+        measurement = self._tare.changes(magnitude, structure, saturated, companions)
+        return self._in_time(measurement, companions or ())
+
+    def _in_time(
+        self,
+        measurement: Measurement,
+        companions: Collection[tuple[str, float] | CompanionReading],
+    ) -> Measurement:
+        """The same without companions that may have felt the sheets before they moved."""
+        readings = [CompanionReading(*each) for each in companions]
+        if not readings:
+            return measurement
+        time_s = readings[0].time_s
+        still = self._still
+        if (
+            still is None
+            or time_s < still.since_s
+            or not are_still(still.changes, measurement.changes)
+        ):
+            self._still = still = _Still(time_s, measurement.changes)
+        late = {each.name for each in readings if each.since_s > time_s - still.since_s}
+        kept = {name: one for name, one in measurement.companions.items() if name not in late}
+        return replace(measurement, companions=kept)
 
     def _measured(self, channel: Channel, scan: FloatArray | None) -> FloatArray | None:
         """A scan less the drives and pairs that repeat the last one; all of it may come again."""
@@ -420,6 +446,13 @@ class Reconstructor:
             size = np.asarray((image * (areas.on_map > 0)).sum(axis=(1, 2)) / share)
         assert size is not None
         return areas, size, np.broadcast_to(estimate.magnitude_sigmas, len(areas))
+
+
+class _Still(NamedTuple):
+    """The frame that all since are like."""
+
+    since_s: float
+    changes: Mapping[Channel, Changes]
 
 
 class _MethodFailedError(Exception):

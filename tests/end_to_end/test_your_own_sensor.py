@@ -99,6 +99,19 @@ def test_a_bent_sheet_says_where_on_the_link_it_is_pressed(newcomer: Newcomer) -
 
 
 @pytest.mark.slow
+def test_a_load_cell_is_described_and_moved_by_a_press(newcomer: Newcomer) -> None:
+    section = "A load cell beneath the sheet"
+    copy, demo, press, watch = PAGE.commands(section)
+    with newcomer:
+        newcomer.run(copy)
+        sheet = newcomer.folder / "my_cell.toml"
+        sheet.write_text(sheet.read_text() + "\n" + "".join(PAGE.blocks("toml", section)))
+        newcomer.run(demo)
+        newcomer.run(press)
+        newcomer.wait_for(watch, " mm ")
+
+
+@pytest.mark.slow
 def test_a_sheet_of_another_outline_is_described_and_drawn(newcomer: Newcomer) -> None:
     section = "A sheet of another outline"
     with newcomer:

@@ -2,8 +2,8 @@
 
 A scan is held against the readings that came before it on the line, so that a replay of the same
 bytes comes to the same. What a reading tells is of some time before: of its dead time, and of the
-time constants that a lag needs to follow. The sheets must have been still since; whether they were
-is for whoever knows the scans (`tactomo.imaging.companions`).
+time constants that a lag needs to follow. The sheets must have been still since; the reconstructor
+knows whether they were.
 """
 
 from __future__ import annotations

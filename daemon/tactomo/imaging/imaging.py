@@ -232,7 +232,6 @@ class Imaging:
     def forget(self) -> None:
         """Take the next dual scan for the first one: it does not follow on those before."""
         self._reconstructor.reset()
-        self._companions.forget()
         self._has_moved = True
         self._publisher.tell_status()
 
@@ -261,7 +260,6 @@ class Imaging:
         if self._marks.follow(dual):
             # Which contacts are which is not forgotten: whoever follows one need not know of this.
             self._reconstructor.forget_shape()
-            self._companions.forget()
         volts = {scan.channel: scan.volts for scan in dual.scans}
         self._publish_scan(dual, timing, volts)
         volts = self._frozen.without(volts, self.reference)
@@ -269,7 +267,7 @@ class Imaging:
         if before is not None and is_at_rest(volts, before.reference):
             self._restore(before)
         clipped = [scan.channel for scan in dual.scans if scan.flags & ScanFlag.SATURATED]
-        companions = self._companions.read(dual, volts, self.reference)
+        companions = self._companions.read(dual)
         frame = self._reconstruct(volts, clipped, companions, is_exact=mark is not None)
         if frame is not None and self._doubt is not None:
             frame = self._doubted(frame, self._doubt)
@@ -333,8 +331,6 @@ class Imaging:
             self._reconstructor.reset()
         if mark.is_cut:
             self._reconstructor.forget_shape()
-        if mark.is_cold or mark.is_cut:
-            self._companions.forget()
         self.calibration.obey(mark.calibration)
         if mark.reference is not None and mark.reference is not self.reference:
             self._reconstructor.set_reference(mark.reference)

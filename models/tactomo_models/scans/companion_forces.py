@@ -21,8 +21,9 @@ class CompanionReading(NamedTuple):
 
     name: str
     value: float  #: in its own unit; NaN where it has none
-    #: whether the sheets may have moved since it felt them: then it tells nothing of the frame
-    is_late: bool = False
+    time_s: float = 0.0  #: of the frame, on any steady clock
+    #: for how long before that the sheets must have been still for it to tell of the frame
+    since_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -371,11 +371,7 @@ class Tare:
         if companions is not None and usable != known.keys():
             flags |= Flag.COMPANION_MISSING
             faults += [f"companion {name} has no reading" for name in known if name not in usable]
-        forces = {
-            name: self._force(readings[name])
-            for name in known
-            if name in usable and not readings[name].is_late
-        }
+        forces = {name: self._force(readings[name]) for name in known if name in usable}
         return Measurement(
             changes, flags, standing_flags, tuple(faults), stage_s, companions=forces
         )

@@ -22,7 +22,7 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.batch import reconstruct_file
 from tactomo_models.methods.method import Skin as Prepared
 from tactomo_models.methods.search import Search
-from tactomo_models.scans.companion_forces import SheetsAndCompanions
+from tactomo_models.scans.companion_forces import CompanionReading, SheetsAndCompanions
 from tactomo_models.scene.field_fit import FieldFit
 from tactomo_models.scene.parameters import COLUMNS, EDGE, PEAK, SIZE, X
 from tactomo_models.scene.reconstruction import Reconstruction
@@ -93,6 +93,21 @@ def test_a_reading_beyond_its_limits_is_none(
     measurement = reconstructor.compare(scan, None, companions=[("load_cell", reading)])
     assert not measurement.companions
     assert Flag.COMPANION_MISSING in measurement.flags
+
+
+def test_a_reading_from_before_the_sheets_moved_tells_nothing(
+    reconstructor: Reconstructor, skin: Skin
+) -> None:
+    """At 20 frames a second, of a cell that shows a force after 70 ms."""
+    reconstructor.reset()
+    found = []
+    for frame in range(8):
+        scan = skin.scan(*[BALL] * (frame >= 4))["magnitude"]
+        reading = CompanionReading("load_cell", 30.0, time_s=frame / 20, since_s=0.07)
+        measurement = reconstructor.compare(scan, None, companions=[reading])
+        assert Flag.COMPANION_MISSING not in measurement.flags
+        found.append(bool(measurement.companions))
+    assert found == [False, False, True, True, False, False, True, True]
 
 
 def test_a_companion_feels_its_region_alone(sensor: SensorDescription) -> None:
