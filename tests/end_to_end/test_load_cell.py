@@ -84,18 +84,22 @@ def pressed(frames: dict[int, Frame]) -> list[Frame]:
     return found
 
 
-def test_a_load_cell_brings_the_force_nearer_live_and_in_a_replay(
+def test_a_load_cell_makes_the_force_sure_live_and_in_a_replay(
     live: Path, sensors: dict[str, Path], tmp_path: Path
 ) -> None:
     recorded = {frame.scan_counter: frame for frame in open_recording(live)}
     again = replayed(live, sensors["cell"], tmp_path / "again.mcap")
     assert {n: f.force_n for n, f in again.items()} == {n: f.force_n for n, f in recorded.items()}
     alone = replayed(live, sensors["alone"], tmp_path / "alone.mcap")
-    off_n = [
-        np.abs([float(frame.force_n or np.nan) - TRUTH_N for frame in pressed(frames)]).max()
+    with_cell, without = (
+        [(frame.force_n, frame.force_sigma_n) for frame in pressed(frames)[-5:]]
         for frames in (recorded, alone)
-    ]
-    assert off_n[0] < 0.03 * TRUTH_N < off_n[1]
+    )
+    for force_n, sigma_n in with_cell:
+        assert force_n == pytest.approx(TRUTH_N, rel=0.04)
+        assert (sigma_n or np.inf) < 0.02 * TRUTH_N
+    # The sheet alone is 20 % low without a bound, or less sure: by its noise, one or the other.
+    assert all((sigma_n or np.inf) > 0.04 * TRUTH_N for _, sigma_n in without)
     assert not any(frame.flags for frame in recorded.values())
 
 
@@ -105,4 +109,4 @@ def test_a_companion_that_never_speaks_is_named(
     frames = pressed(replayed(live, sensors["pad"], tmp_path / "pad.mcap"))
     assert all(frame.flags == {"companion_missing"} for frame in frames)
     assert all("companion pad has no reading" in str(frame.tier_reason) for frame in frames)
-    assert all(abs((frame.force_n or 0) - TRUTH_N) < 0.03 * TRUTH_N for frame in frames)
+    assert all(abs((frame.force_n or 0) - TRUTH_N) < 0.04 * TRUTH_N for frame in frames)
