@@ -188,6 +188,22 @@ def test_a_demo_in_the_background_of_a_script_ends_by_sigint() -> None:
 
 
 @pytest.mark.slow
+def test_a_demo_prints_commands_that_a_shell_without_them_on_its_path_finds(
+    start: Callable[..., subprocess.Popen[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", os.defpath)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    free = "tcp://127.0.0.1:0"
+    demo = start(
+        *("demo", "--viewer-port", 0, "--stream", free, "--control", free, "--twin-control", free)
+    )
+    assert demo.stdout is not None
+    poke = next(line for line in demo.stdout if " poke press " in line)
+    done = subprocess.run(poke, shell=True, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
 def test_a_family_notices_whoever_ends_and_tells_its_last_words() -> None:
     with Family() as family:
         viewer = family.start("page", "viewer", "--viewer-port", "0", *NOWHERE)

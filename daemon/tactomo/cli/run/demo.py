@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
+import shutil
 import sys
 import tempfile
 import time
@@ -207,20 +209,32 @@ def _stay(family: Family, addresses: Mapping[str, Any], announce: bool) -> None:
 
 
 def _print_addresses(addresses: Mapping[str, Any]) -> None:
-    """Say what to do next; lines of commands stand alone, to be copied from any terminal."""
+    """Say what to do next; lines of commands stand alone, to be copied to a terminal here."""
     name, stream = addresses["sensor"], addresses["stream"]
+    folder = _folder_of_programs()
+    tactomo = shlex.quote(f"{folder}tactomo")
     at = "" if len(running("daemon")) == 1 else f" --address {stream}"
     at_twin = "" if len(running("twin")) == 1 else f" --address {addresses.get('twin')}"
     press = ", and press the skin there by mouse" if "twin" in addresses else ""
     say(f"{name} is running; Ctrl-C stops everything. Open{press}:\n")
     say(f"    {addresses['viewer']}\n\nOr in another terminal:\n")
     if "twin" in addresses:
-        say(f"    tactomo poke press x_mm=10 y_mm=-20{at_twin}")
+        say(f"    {tactomo} poke press x_mm=10 y_mm=-20{at_twin}")
     for command in ("watch", "status", "tare", "record press.mcap --seconds 10"):
-        say(f"    tactomo {command}{at}")
+        say(f"    {tactomo} {command}{at}")
     where = "" if stream == options.DEFAULT_STREAM else f', address="{stream}"'
-    say("\nOr in Python:\n\n    from tactomo_client import subscribe\n")
+    say(f"\nOr in {f'{folder}python' if folder else 'Python'}:\n")
+    say("    from tactomo_client import subscribe\n")
     say(f'    for frame in subscribe("{name}"{where}):\n        print(frame.contacts)\n')
+
+
+def _folder_of_programs() -> str:
+    """Return what a shell in this folder puts before `tactomo`: nothing if it is on the PATH."""
+    ours, here = Path(sys.executable).parent, Path.cwd()
+    found = shutil.which("tactomo")
+    if not (ours / "tactomo").exists() or (found and Path(found).samefile(ours / "tactomo")):
+        return ""
+    return f"{ours.relative_to(here) if ours.is_relative_to(here) else ours}/"
 
 
 def _optional(name: str, value: object) -> list[str]:
