@@ -19,6 +19,7 @@ A method of one's own is a class with these two functions. This one is complete:
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 from tactomo_protocol import Channel
@@ -27,6 +28,7 @@ from tactomo_models.arrays import FloatArray, Image
 from tactomo_models.methods.trained_networks import SensorNetworks
 from tactomo_models.physics.artifact import Artifact, load_or_build_artifact
 from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.physics.node_mesh import NodeMesh
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scans.reference import Reference
@@ -63,6 +65,11 @@ class Skin:
         """Of the magnitude channel's change under pressure; 1 where there is no such channel."""
         has_magnitude = Channel.MAGNITUDE in self.description.channels
         return self.description.sign(Channel.MAGNITUDE) if has_magnitude else 1.0
+
+    @cached_property
+    def mesh(self) -> NodeMesh:
+        """The nodes of the Jacobian's columns: places, triangles, areas, electrodes."""
+        return NodeMesh.of(self.forward)
 
     @classmethod
     def of(cls, description: SensorDescription, artifact: Artifact | None = None) -> Skin:

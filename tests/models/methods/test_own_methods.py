@@ -155,3 +155,16 @@ def test_a_class_that_needs_arguments_is_no_method(
     reconstructor = Reconstructor(sensor)
     with pytest.raises(MethodError, match=r"needy:Needy' cannot be made.*without arguments"):
         reconstructor.method = "needy:Needy"
+
+
+def test_the_mesh_has_the_jacobians_nodes_and_a_laplace_prior(sensor: SensorDescription) -> None:
+    skin = Skin.of(sensor)
+    mesh = skin.mesh
+    assert len(mesh.nodes_m) == len(mesh.areas_m2) == skin.artifact.jacobian.shape[1]
+    assert mesh.electrodes_m.shape == (sensor.electrode_count, 2)
+    one, two = (
+        mesh.nodes_m[mesh.triangles[:, k]] - mesh.nodes_m[mesh.triangles[:, 0]] for k in (1, 2)
+    )
+    area = np.abs(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]).sum() / 2
+    slope = mesh.nodes_m @ [3.0, -4.0] + 1  # |gradient| 5
+    assert slope @ (mesh.smoothness() @ slope) == pytest.approx(25 * area)

@@ -1,0 +1,53 @@
+"""The mesh that a method of one's own works on: the nodes whose conductivity pressing changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+import skfem
+from skfem.models.poisson import laplace
+
+from tactomo_models.arrays import FloatArray, IntArray
+from tactomo_models.physics.forward import ForwardModel
+
+
+@dataclass(frozen=True)
+class NodeMesh:
+    """P nodes of a sheet, in the order of the Jacobian's columns, and the triangles of them.
+
+    Attributes:
+        nodes_m: (P, 2) x and y.
+        triangles: (T, 3) nodes of each triangle whose three corners are among the P.
+        areas_m2: (P,) share of the sheet's area that belongs to each node.
+        electrodes_m: (L, 2) middle of each electrode, in the order of the electrodes' numbers.
+    """
+
+    nodes_m: FloatArray
+    triangles: IntArray
+    areas_m2: FloatArray
+    electrodes_m: FloatArray
+
+    @classmethod
+    def of(cls, forward: ForwardModel) -> NodeMesh:
+        """Take the nodes that can be pressed from a sheet's model."""
+        bare = forward.bare
+        number = np.full(bare.points.shape[1], -1, np.intp)
+        number[bare.pressable] = np.arange(len(bare.pressable))
+        triangles = number[bare.triangles.T]
+        return cls(
+            nodes_m=bare.points[:, bare.pressable].T,
+            triangles=triangles[(triangles >= 0).all(axis=1)],
+            areas_m2=forward.node_areas_m2,
+            electrodes_m=forward.description.electrode_centres_m,
+        )
+
+    def smoothness(self) -> sp.csr_matrix:
+        """Return the matrix K (P, P) of x'Kx = ∫|∇x|² dA, for x (P,) linear on each triangle.
+
+        K is the stiffness matrix of the Laplace operator with a free rim: symmetric, without a unit
+        for relative changes, and 0 for what is constant.
+        """
+        mesh = skfem.MeshTri(self.nodes_m.T.copy(), self.triangles.T.copy())
+        return sp.csr_matrix(laplace.assemble(skfem.Basis(mesh, skfem.ElementTriP1())))
