@@ -448,7 +448,7 @@ def test_rate_latency_method_and_quality_are_shown(page: Page) -> None:
     heights = set()
     for reason in ("quiet", "no change above the noise"):
         page.skin.frame |= {"tier_reason": reason}
-        wait_until(lambda reason=reason: page["made-by-reason"].text == reason)
+        wait_until(partial(reads, page, "made-by-reason", reason))
         heights.add(page.js(height))
     assert len(heights) == 1  # room is kept: nothing below jumps
     page.skin.frame = {}
