@@ -347,6 +347,9 @@ def test_a_mounted_sheet_is_pressed_and_turned_on_its_surface(page: Page) -> Non
     mouse("Released", 105, 5)
     wait_until(lambda: page.js(SEEN, -40, -30)[0] > left + 10)
     assert len(page.presses()) == pressed
+    left = page.js(SEEN, -40, -30)[0]
+    page["surface"].send_keys(Keys.ARROW_LEFT)
+    wait_until(lambda: page.js(SEEN, -40, -30)[0] < left - 2)
     page.skin.status = page.skin.status | {"description": DESCRIPTION}
     wait_until(lambda: not page["surface"].is_displayed())
 

@@ -1,6 +1,6 @@
 // Draws a mounted sheet on its surface: the image, contacts with arrows of force, and presses. It is
-// turned by dragging beside the sheet or with the right button, zoomed by the wheel, and pressed as
-// the flat map is. Drawn by three.js (three.module.min.js, MIT).
+// turned by dragging beside the sheet, with the right button or by the arrow keys, zoomed by the
+// wheel, and pressed as the flat map is. Drawn by three.js (three.module.min.js, MIT).
 
 import * as THREE from "./three.module.min.js";
 
@@ -16,6 +16,8 @@ const RING_POINTS = 48;
 const CUT_OUT_PX = 1024;
 const EDGE_STEPS = 24;          // of an edge of the outline, which follows the surface
 const TURN_PER_PX = 0.008;      // radians
+const TURN_PER_KEY = 0.1;
+const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
 
 export class SurfaceView {
   /** `flat` is the MapView of the same sheet, `onTurn()` is called when the view has been turned. */
@@ -310,6 +312,13 @@ export class SurfaceView {
       this.onTurn();
     });
     for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, () => { last = null; });
+    canvas.addEventListener("keydown", (event) => {
+      const arrow = ARROWS[event.key];
+      if (!arrow || event.ctrlKey || event.altKey || event.metaKey) return;
+      event.preventDefault();
+      this.#turn(TURN_PER_KEY * arrow[0], TURN_PER_KEY * arrow[1]);
+      this.onTurn();
+    });
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();

@@ -123,7 +123,7 @@ async function showMount(mount) {
   room.parentElement.classList.toggle("mounted", Boolean(mount));
   view.resize();
   if (!mount) return;
-  const turn = "drag beside it to turn it";
+  const turn = "drag beside the sheet to turn it, or use the arrow keys";
   try {
     const { SurfaceView } = await import("./surface_view.js");
     if (!surface) {
