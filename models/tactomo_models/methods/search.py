@@ -63,7 +63,7 @@ CHECKED = 0.5
 # Chi-squared over the count of data, from which a contact is missing rather than of another kind.
 SURPRISE = 2.0
 ROUNDS = 4  # of questions, each after what the last one changed
-ANOTHER_PRESS = np.log(1.25)  # change of a peak, from which evidence of a kind is of another press
+ANOTHER_PRESS = 1.25  # factor of a peak, from which evidence of a kind is of another press
 
 
 @dataclass(frozen=True)
@@ -214,16 +214,18 @@ class Search:
 
     def _asking_again(self, belief: Belief, *, due: bool) -> Belief:
         """Ask a contact that is pressed quite differently; where it is due, what is open, too."""
-        peaks = belief.account.contacts[:, PEAK]
+        peaks = _pressed_peaks(belief.account)
         asked = belief.asked_peaks if len(belief.asked_peaks) == len(peaks) else peaks
-        same = np.abs(np.log(peaks / asked)) < ANOTHER_PRESS
+        same = (peaks == 0) | (peaks < ANOTHER_PRESS * asked) & (asked < ANOTHER_PRESS * peaks)
         if same.all() and not due:
             return belief
         rivals = tuple(
             {
-                kind: replace(rival, is_open=rival.is_open or (due and rival.log_odds > HOPELESS))
+                kind: replace(
+                    rival,
+                    is_open=rival.is_open or not is_same or (due and rival.log_odds > HOPELESS),
+                )
                 for kind, rival in mine.items()
-                if is_same
             }
             for mine, is_same in zip(belief.rivals, same, strict=True)
         )
@@ -397,7 +399,7 @@ class Search:
         return replace(
             belief,
             since=Since.after(frame.measured, account.jacobian, precision),
-            asked_peaks=account.contacts[:, PEAK],
+            asked_peaks=_pressed_peaks(account),
             done=True,
         )
 
@@ -657,6 +659,11 @@ class Search:
 def _is_light(account: Account) -> bool:
     """Whether contacts are there, none of which the graded sheet tells to press."""
     return account.family.count > 0 and bool(account.is_hardly_pressed.all())
+
+
+def _pressed_peaks(account: Account) -> FloatArray:
+    """Peaks (K,); 0 where the graded sheet tells none, and so nothing of the kind either."""
+    return np.where(account.is_hardly_pressed, 0.0, account.contacts[:, PEAK])
 
 
 def _touching(contacts: FloatArray, near_m: float) -> Iterator[list[int]]:

@@ -130,3 +130,18 @@ def test_a_palm_is_followed_while_the_reference_is(small: SensorDescription) -> 
     counted = list(scores)
     assert len(counted) == len(palm)
     assert {score.count_right for score in counted} <= {True, False}
+
+
+@pytest.mark.slow
+def test_a_palm_that_falls_towards_its_edge_is_told_so_once_the_graded_sheet_feels_it(
+    paper: SensorDescription,
+) -> None:
+    """Its kinds are asked again then: what was told of them below the onset says nothing."""
+    case = palm_sequence(paper, "tuning", 5)
+    last = [outcome.score for outcome in play([case], "auto")][-1]
+    assert case.frames[-1].presses["A"].profile == "dome"
+    (contact,) = last.contacts
+    assert contact.peak_error is not None
+    assert contact.peak_error_sigmas is not None
+    assert abs(contact.peak_error) < 0.1
+    assert abs(contact.peak_error_sigmas) < 3
