@@ -36,7 +36,8 @@ class Rival:
     is_open: bool = False  # whether it is to be asked once more
     is_solved: bool = False  # whether the odds are of solved fields, not predicted
     predicted: float | None = None  # predicted log odds when it was asked last
-    before: float | None = None  # log odds in other frames
+    before: float = 0.0  # mean of the log odds in other frames
+    frames: int = 0  # how many these are
     found: Prediction | None = None  # where it was asked last, all contacts moved with it
 
     @property
@@ -54,7 +55,7 @@ class Rival:
 
         A mean and no sum: where a contact stays, errors of the sheet repeat themselves.
         """
-        return log_odds if self.before is None else (log_odds + self.before) / 2
+        return (log_odds + self.frames * self.before) / (self.frames + 1)
 
 
 Rivals = Mapping[Kind, Rival]
@@ -121,7 +122,8 @@ def _rival_of(
         log_odds,
         found.contacts[0] - contact if is_one else found.contacts,
         found.sigmas[0] if is_one else found.sigmas,
-        before=before.before if before else None,
+        before=before.before if before else 0.0,
+        frames=before.frames if before else 0,
         found=found,
     )
 
@@ -171,6 +173,7 @@ def in_another_frame(rivals: Rivals) -> Rivals:
             is_open=one.is_open or one.is_doubtful,
             is_solved=False,
             before=one.log_odds,
+            frames=one.frames + (one.is_solved or one.found is not None),
             found=None,
         )
         for kind, one in rivals.items()
@@ -188,7 +191,7 @@ def opened(rivals: Rivals, gain: float) -> Rivals:
             one,
             is_open=one.is_open or one.log_odds >= least or kind is Kind.NONE,
             is_solved=one.is_solved and one.predicted is not None,
-            before=None,
+            frames=0,
             found=None,
         )
         for kind, one in rivals.items()

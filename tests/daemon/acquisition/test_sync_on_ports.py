@@ -60,7 +60,7 @@ def test_a_channel_that_comes_after_the_tare_says_that_it_has_no_reference(bench
     line.hello = both
     line.say(both)
     b.step(channels=(Channel.STRUCTURE, Channel.MAGNITUDE))
-    assert b.listener.event("channel_back")["next_step"].startswith("tare")
+    assert b.listener.event("channel_back")["next_step"].startswith("run `tactomo tare`")
 
 
 def test_a_scan_that_comes_too_late_is_counted_and_left_out(bench: Start) -> None:
