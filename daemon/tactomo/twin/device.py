@@ -264,7 +264,7 @@ class Twin:
 
     def _read_companions(self, time_s: float, counter: int) -> list[CompanionReading]:
         """Return what companions read; only a simulated skin knows the force on it."""
-        if not isinstance(self._skin, SkinSimulator):
+        if not isinstance(self._skin, SkinSimulator) or not self._skin.description.companion:
             return []
         forces_n = self._skin.forces_n(self._presses_at(time_s))
         return self._companions.read(forces_n, time_s, counter)

@@ -19,6 +19,7 @@ from tactomo_models.scene.field_fit import (
     FittedField,
     Measured,
     bounded_step,
+    predicted_gain,
 )
 from tactomo_models.scene.parameters import PEAK
 from tactomo_models.scene.pressure import CLEARLY
@@ -212,8 +213,3 @@ def damped_steps(
             return
         yield step, damping
         damping *= 5
-
-
-def predicted_gain(normal: FloatArray, gradient: FloatArray) -> float:
-    """What further steps would gain in cost: no solve."""
-    return float(gradient @ np.linalg.solve(normal, gradient))

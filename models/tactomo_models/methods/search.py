@@ -363,7 +363,7 @@ class Search:
         """One thing more: a fit, a contact's kinds, what they lead to, or what is missing."""
         account = belief.account
         # Fitted to its end by itself, the first of several contacts would grow over them all.
-        if not belief.lacks_none and account.chi_squared > SURPRISE * frame.likelihood.count:
+        if not belief.lacks_none and self._explains_little(account, frame):
             born = self._with_missing(account, frame, far=True)
             if born is not account:
                 return self._grown(belief, born)
@@ -475,6 +475,7 @@ class Search:
 
     @staticmethod
     def _explains_little(account: Account, frame: Frame) -> bool:
+        """Whether so much is left that a contact is missing rather than of another kind."""
         return account.chi_squared > SURPRISE * frame.likelihood.count
 
     def _checked(
@@ -606,7 +607,7 @@ class Search:
                 self._start_peak(frame),
             )
             # With a free ratio the first of several contacts would grow over them all.
-            holds = account.chi_squared > SURPRISE * frame.likelihood.count
+            holds = self._explains_little(account, frame)
             start = self._account(np.vstack([each, born]), account.fitted.log_ratio, frame)
             steps = STEPS if holds else self._steps(account, frame)
             grown = self._descended(start, frame, steps, holds_ratio=holds)

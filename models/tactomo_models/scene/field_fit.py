@@ -402,17 +402,13 @@ class FieldFit:
             # No gain because the budget ended says nothing about a minimum.
             settled = 0 < gain < SETTLED * fitted.cost or better.damping >= MAX_DAMPING
             if gain > 0 and not settled:
-                settled = self.predicted_gain(better) < PREDICTED * better.cost
+                assert better.jacobian is not None
+                left = predicted_gain(*self.normal_equations(better, better.jacobian))
+                settled = left < PREDICTED * better.cost
             fitted = replace(better, converged=settled)
             if settled or budget.over:
                 break
         return fitted
-
-    def predicted_gain(self, fitted: FittedField) -> float:
-        """What further steps would gain in cost, by the Jacobian of the last one: no solve."""
-        assert fitted.jacobian is not None
-        normal, gradient = self.normal_equations(fitted, fitted.jacobian)
-        return float(gradient @ np.linalg.solve(normal, gradient))
 
     def normal_equations(self, fitted: FittedField, J: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Matrix (N + 1, N + 1) and gradient (N + 1,) of half the linearised cost."""
@@ -454,6 +450,11 @@ class FieldFit:
             if budget.over:
                 break
         return replace(fitted, damping=damping)
+
+
+def predicted_gain(normal: FloatArray, gradient: FloatArray) -> float:
+    """What further steps would gain in cost, by normal equations: no solve of the sheets."""
+    return float(gradient @ np.linalg.solve(normal, gradient))
 
 
 def bounded_step(

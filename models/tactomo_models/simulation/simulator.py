@@ -69,13 +69,10 @@ class SkinSimulator:
 
     def forces_n(self, presses: Sequence[Press]) -> dict[str, float]:
         """The force in newtons that each companion of the sensor feels."""
-        companions = self.description.companion.items()
-        if not companions:
-            return {}
         pressure, coverage = strongest(presses, self._x, self._y, self.spacing_m)
         return {
             name: float(self.forward.newtons_per_kpa(one.region_m) @ (pressure * coverage))
-            for name, one in companions
+            for name, one in self.description.companion.items()
         }
 
     @property
