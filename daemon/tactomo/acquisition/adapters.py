@@ -127,14 +127,14 @@ def _is_there(folder: Path) -> bool:
 
 
 def _adapter(folder: Path, root: Path) -> Adapter:
-    device = (folder / "device").resolve()
+    device = _resolved(folder / "device")
     usb = _nearest(device, "idVendor")
     interface = _nearest(device, "bInterfaceNumber")
     path = root / "dev" / folder.name
     return Adapter(
         path=f"/dev/{folder.name}",
         names=tuple(_names(path, root)),
-        driver=(device / "driver").resolve().name if (device / "driver").exists() else "",
+        driver=_resolved(device / "driver").name if (device / "driver").exists() else "",
         vendor_id=_number(usb / "idVendor", 16) if usb else None,
         product_id=_number(usb / "idProduct", 16) if usb else None,
         maker=_text(usb / "manufacturer") if usb else "",
@@ -154,10 +154,10 @@ def _nearest(device: Path, file: str) -> Path | None:
 
 
 def _names(path: Path, root: Path) -> Iterator[str]:
-    device = path.resolve()
+    device = _resolved(path)
     for folder in LINK_FOLDERS:
         for link in sorted((root / "dev" / folder).glob("*")):
-            if link.resolve() == device:
+            if _resolved(link) == device:
                 yield f"/dev/{folder}/{link.name}"
 
 
@@ -203,6 +203,10 @@ def _open_files(process: Path) -> Iterator[tuple[str, Path]]:
             with contextlib.suppress(OSError):  # closed by now
                 path = process / "fd" / descriptor
                 yield os.readlink(path), path
+
+
+def _resolved(path: Path) -> Path:
+    return Path(device_of(str(path)))
 
 
 def _number(file: Path, base: int = 10) -> int | None:

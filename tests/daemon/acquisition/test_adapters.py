@@ -56,6 +56,22 @@ def test_an_ftdi_adapter_is_described_in_full(machine: FakeMachine) -> None:
     ]
 
 
+def test_a_name_that_goes_while_it_is_read_is_absent(
+    machine: FakeMachine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    machine.plug_ftdi("ttyUSB0", "1-3", "A50285BI")
+    readlink = os.readlink
+
+    def unplugged(path: Any) -> str:
+        if "by-id" in str(path):
+            raise FileNotFoundError(path)
+        return str(readlink(path))
+
+    monkeypatch.setattr(os, "readlink", unplugged)
+    (adapter,) = list_adapters(machine.root)
+    assert [Path(name).parent.name for name in adapter.names] == ["by-path"]
+
+
 def test_a_microcontroller_has_no_latency_timer(machine: FakeMachine) -> None:
     machine.plug_acm("ttyACM0", "1-4", "7F3A")
     adapter = adapter_at(machine, "/dev/ttyACM0")

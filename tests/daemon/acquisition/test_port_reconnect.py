@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 import serial
+from tactomo.acquisition.adapters import holders
 from tactomo.acquisition.connection import Connection
 from tactomo.acquisition.liveness import PATIENCE_S
 from tactomo.acquisition.open_serial import DEVICE_GONE, open_serial
@@ -69,8 +70,7 @@ def hold(until: Until) -> Iterator[Hold]:
     def start(path: Path, *command: str) -> subprocess.Popen[bytes]:
         process = subprocess.Popen([*command, str(path)], stdout=subprocess.DEVNULL)
         started.append(process)
-        device, descriptors = os.path.realpath(path), Path(f"/proc/{process.pid}/fd")
-        until(lambda: any(os.path.realpath(fd) == device for fd in descriptors.glob("*")))
+        until(lambda: any(holder.pid == process.pid for holder in holders(str(path))))
         return process
 
     yield start
