@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from itertools import chain
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from tactomo.cli import options
-from tactomo.cli.output import print_json, say, table
-from tactomo.cli.plot.plot import prepare_folder
+from tactomo.cli.output import print_json, table
 from tactomo.errors import TactomoError
 
 from tactomo_lab.commands.report import Seeds, chosen_names, shown
@@ -35,7 +32,6 @@ class _Part:
     table: Table
     caption: str
     facts: dict[int, Any]
-    pictures: dict[int, Callable[[Path], None]]
 
 
 @dataclass(frozen=True)
@@ -55,7 +51,7 @@ app = options.typer_app()
 @app.command(
     epilog=options.examples(
         "tactomo evaluate paper",
-        "tactomo evaluate paper --figure 9,10 --method tikhonov,auto --picture figures",
+        "tactomo evaluate paper --figure 9,10 --method tikhonov,auto",
         "tactomo evaluate paper --figure 5 --count 10",
         "tactomo evaluate paper --seeds reporting --json > paper.json",
     )
@@ -77,10 +73,6 @@ def paper(
     ] = None,
     seeds: Seeds = "tuning",
     sensor: options.Description = options.DEFAULT_DESCRIPTION,
-    picture: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Draw each figure into it. Needs matplotlib."),
-    ] = None,
     as_json: options.JsonOutput = False,
 ) -> None:
     """Repeat the paper's evaluation on simulated skins, beside the paper's printed numbers.
@@ -97,8 +89,6 @@ def paper(
 
     figures = {int(name) for name in chosen_names(figure, map(str, FIGURES), "--figure")}
     wanted = method or DEFAULT_METHODS
-    if picture is not None:
-        prepare_folder(picture)
     description = load_description(sensor)
     missing = left_out(description, wanted)
     methods = [name for name in wanted if name not in missing]
@@ -123,7 +113,6 @@ def paper(
     if not as_json:
         _print_settings(settings)
     facts: dict[str, Any] = {}
-    drawn = 0
     for numbers_of, experiment in EXPERIMENTS.items():
         asked = figures.intersection(numbers_of)
         if not asked:
@@ -132,18 +121,11 @@ def paper(
         facts |= {str(number): found for number, found in part.facts.items()}
         if not as_json:
             _print(part)
-        if picture is not None:
-            for number, draw in part.pictures.items():
-                draw(picture / f"figure_{number}.png")
-                drawn += 1
     if as_json:
         print_json({**settings, "figures": facts})
-    if picture is not None:
-        say(f"wrote {drawn} pictures to {picture}", err=True)
 
 
 def _simulation_study(study: _Study, asked: set[int]) -> _Part:
-    from tactomo_lab.commands.paper_pictures import draw_simulation
     from tactomo_lab.evaluation.paper import COUNTS, SNR_DB, cells, paper_scenes
     from tactomo_lab.evaluation.play import play
 
@@ -168,12 +150,10 @@ def _simulation_study(study: _Study, asked: set[int]) -> _Part:
         made,
         "",
         {5: [asdict(point) for point in points]},
-        {5: partial(draw_simulation, points)},
     )
 
 
 def _response_test(study: _Study, asked: set[int]) -> _Part:
-    from tactomo_lab.commands.paper_pictures import draw_response
     from tactomo_lab.evaluation.paper import RESPONSE_KPA, measure_response
 
     total = len(RESPONSE_KPA) * len(study.rigs)
@@ -188,12 +168,10 @@ def _response_test(study: _Study, asked: set[int]) -> _Part:
         made,
         "",
         {7: [asdict(point) for point in points]},
-        {7: partial(draw_response, points)},
     )
 
 
 def _single_areas(study: _Study, asked: set[int]) -> _Part:
-    from tactomo_lab.commands.paper_pictures import draw_images, draw_traces
     from tactomo_lab.evaluation.paper import PAPER_MAGNITUDE_ERROR, SINGLE, magnitude_errors
 
     frames = _image(study, SINGLE, "Figs. 8 and 9")
@@ -228,22 +206,16 @@ def _single_areas(study: _Study, asked: set[int]) -> _Part:
             for method, (error, kpa) in PAPER_MAGNITUDE_ERROR.items()
         },
     }
-    pictures: dict[int, Callable[[Path], None]] = {
-        8: partial(draw_images, frames, study.description),
-        9: partial(draw_traces, frames, errors),
-    }
     return _Part(
         "Figs. 8 and 9: magnitude error over cases 1 to 4, at its worst pressure",
         made,
         "ours: of the method's own largest estimate, the paper's 0-1 normalisation; of range: of "
         "the change at 200 kPa; of contacts: likewise, of the magnitudes that contacts have",
         {9: facts},
-        {number: pictures[number] for number in sorted(asked)},
     )
 
 
 def _localisation(study: _Study, asked: set[int]) -> _Part:
-    from tactomo_lab.commands.paper_pictures import draw_places
     from tactomo_lab.evaluation.paper import LOCALISATION, PAPER_LOCALISATION_MM, locate
 
     places = [locate(frame, study.description) for frame in _image(study, LOCALISATION, "Fig. 10")]
@@ -274,12 +246,10 @@ def _localisation(study: _Study, asked: set[int]) -> _Part:
         "ours: of the image's mass, as the paper's; contact: of the contact that is reported; "
         "one contact: share of presses in which one is",
         {10: facts},
-        {10: partial(draw_places, places, study.description)},
     )
 
 
 def _several_areas(study: _Study, asked: set[int]) -> _Part:
-    from tactomo_lab.commands.paper_pictures import draw_images
     from tactomo_lab.evaluation.paper import MORE, TWO, read_areas
     from tactomo_lab.scenes.measures import mean
 
@@ -303,7 +273,6 @@ def _several_areas(study: _Study, asked: set[int]) -> _Part:
             )
         made.add_section()
     facts: dict[int, Any] = {}
-    pictures: dict[int, Callable[[Path], None]] = {}
     for number, of_figure in cases.items():
         numbers = {case.number for case in of_figure}
         facts[number] = [
@@ -311,8 +280,6 @@ def _several_areas(study: _Study, asked: set[int]) -> _Part:
             for one in read
             if one.case in numbers
         ]
-        own = [frame for frame in frames if frame.case.number in numbers]
-        pictures[number] = partial(draw_images, own, study.description, traces=number == 11)
     return _Part(
         "Figs. 11 and 12: two to four areas, simulated; the paper prints no numbers",
         made,
@@ -320,7 +287,6 @@ def _several_areas(study: _Study, asked: set[int]) -> _Part:
         "the harder pressed one reads higher; alike: of pairs under one pressure, the lower "
         "reading over the other; counted: right number of contacts; *: places and sizes are ours",
         facts,
-        pictures,
     )
 
 

@@ -15,6 +15,7 @@ from tactomo.errors import needs
 
 if TYPE_CHECKING:
     from rich.progress import Progress
+    from tactomo_models import SensorDescription
 
     from tactomo_lab.training.configurations import Prepared
     from tactomo_lab.training.train import Epoch, Settings, Training
@@ -27,9 +28,7 @@ INTERRUPTED = 130
 FEWEST_TANKS = 250  # a shard of them
 
 # The models' CONFIGURATIONS, which are not imported for a command line that only shows its help.
-ConfigurationName: TypeAlias = Literal[
-    "ours", "ours-small", "ours-single", "paper-single", "paper-multimodal"
-]
+ConfigurationName: TypeAlias = Literal["ours", "ours-small", "ours-single"]
 
 app = typer_app()
 
@@ -37,21 +36,12 @@ app = typer_app()
 @app.command(
     epilog=examples(
         "tactomo models simulate scenes/robust",
-        "tactomo models simulate scenes/paper --preset paper",
         "tactomo models simulate scenes/mine -d my_skin.toml --scenes 8000 --jobs 4",
     )
 )
 def simulate(
     folder: Annotated[Path, typer.Argument(help="Folder for the scenes; made if missing.")],
-    preset: Annotated[
-        Literal["paper", "robust"],
-        typer.Option(
-            help="As the paper's, or with errors as real skins have them and any contacts."
-        ),
-    ] = "robust",
-    scenes: Annotated[
-        int | None, typer.Option(min=1, help="How many. [paper: 12000, robust: 24000]")
-    ] = None,
+    scenes: Annotated[int, typer.Option(min=1, help="How many.")] = 24000,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the whole set.")] = 0,
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Processes. [one for each core]", show_default=False)
@@ -62,33 +52,29 @@ def simulate(
     """Simulate scenes to train networks on: voltages of both channels, and the truth.
 
     The same command continues after Ctrl-C; a larger --scenes extends a finished set. Scenes depend
-    only on the preset, the seed and their number, and none is a scene of `tactomo evaluate`. A
+    only on the seed and their number, and none is a scene of `tactomo evaluate`. A
     scene takes a tenth of a second on one core, a thousand scenes take 2 MB.
 
-    *paper*: one to four ellipses that do not overlap, 0.75 to 0.95 S/m on an even sheet of 1 S/m,
-    100 S/m in the structure channel. *robust*: none to ten contacts of several shapes, flat or
-    soft, also lighter and heavier than the range; both signs; contrast 10 to 100; sheets up to as
-    uneven as hand-made sheets; uneven, displaced and sometimes weak electrodes. Training adds the
-    noise.
+    Scenes have none to ten contacts of several shapes, flat or soft, also lighter and heavier than
+    the range; both signs; contrast 10 to 100; sheets up to as uneven as hand-made sheets; uneven,
+    displaced and sometimes weak electrodes. Training adds the noise.
 
     Needs `pip install 'tactomo-lab[train]'`.
     """
     from tactomo_models import load_description
 
-    from tactomo_lab.scenes.presets import SCENES
     from tactomo_lab.training.training_scenes import simulate as simulate_scenes
 
     description = load_description(sensor)
-    total = scenes or SCENES[preset]
-    steps = simulate_scenes(description, preset, folder, total, seed=seed, jobs=jobs or -1)
+    steps = simulate_scenes(description, folder, scenes, seed=seed, jobs=jobs or -1)
     with needs("training", EXTRA):
-        before, now = _follow(steps, total, f"{preset} scenes", folder)
+        before, now = _follow(steps, scenes, "scenes", folder)
     if as_json:
-        settings = {"folder": str(folder), "preset": preset, "seed": seed}
         counts = {"scenes": before + now, "new": now}
-        print_json({**settings, "sensor": description.name, **counts})
+        told = {"folder": str(folder), "seed": seed, "sensor": description.name}
+        print_json({**told, **counts})
     else:
-        say(f"{folder}: {total} {preset} scenes, {now} of them new")
+        say(f"{folder}: {scenes} scenes, {now} of them new")
 
 
 @app.command(
@@ -96,7 +82,6 @@ def simulate(
         "tactomo models train scenes/robust",
         "tactomo models train scenes/robust --epochs 5 --output trial.onnx",
         "tactomo models train scenes/robust --start ours.pt --checkpoint more.pt",
-        "tactomo models train scenes/paper --configuration paper-multimodal",
     )
 )
 def train(
@@ -139,10 +124,8 @@ def train(
     by noise and number of contacts.
 
     *ours* takes both channels' voltages; *ours-small* is half as wide; *ours-single* takes the
-    magnitude channel alone. These need scenes of the preset robust. *paper-single* and
-    *paper-multimodal* are the paper's networks and need scenes of the preset paper, whose images
-    are computed first and kept beside the scenes. Each takes one to two hours on two cores. A few
-    more epochs with --start and a lower --rate finish a shorter training.
+    magnitude channel alone. Each takes one to two hours on two cores. A few more epochs with
+    --start and a lower --rate finish a shorter training.
 
     tactomo then uses the network in the cache for this sensor, instead of the shipped network;
     delete the file to return to the shipped one. Needs `pip install 'tactomo-lab[train]'`.
@@ -151,22 +134,23 @@ def train(
         from tactomo_models import load_description
         from tactomo_models.methods.trained_networks import own_path
 
-        from tactomo_lab.training.configurations import CONFIGURATIONS, export_trained
+        from tactomo_lab.training.configurations import KIND, SETTINGS, export_trained
         from tactomo_lab.training.train import use
 
         use(device, jobs)
-        description, chosen = load_description(sensor), CONFIGURATIONS[configuration]
-        settings = replace(chosen.settings, seed=seed, device=device)
+        description = load_description(sensor)
         settings = replace(
-            settings,
-            epochs=epochs or settings.epochs,
-            batch=batch or settings.batch,
-            rate=rate or settings.rate,
+            SETTINGS,
+            epochs=epochs or SETTINGS.epochs,
+            batch=batch or SETTINGS.batch,
+            rate=rate or SETTINGS.rate,
+            seed=seed,
+            device=device,
         )
-        prepared = _prepare(configuration, folder, sensor, seed, jobs, start)
+        prepared = _prepare(configuration, folder, description, seed, start)
         kept = checkpoint or folder / f"{configuration}.pt"
         training = _train(prepared, settings, kept, configuration)
-        written = output or own_path(description, chosen.kind)
+        written = output or own_path(description, KIND)
         export_trained(prepared, training, written)
     if as_json:
         told = {
@@ -225,24 +209,16 @@ def train_tanks(
 
 
 def _prepare(
-    configuration: str, folder: Path, sensor: str, seed: int, jobs: int | None, start: Path | None
+    configuration: str, folder: Path, description: SensorDescription, seed: int, start: Path | None
 ) -> Prepared:
-    """Read the scenes; the paper's networks need images of them first."""
+    """Read the scenes."""
     from rich.text import Text
     from tactomo.cli.console import Console
-    from tactomo_models import load_description
 
-    from tactomo_lab.training.configurations import CONFIGURATIONS, check_scenes, prepare
-    from tactomo_lab.training.preliminary import make_images
-    from tactomo_lab.training.training_scenes import read_manifest
+    from tactomo_lab.training.configurations import CONFIGURATIONS, prepare
 
-    description, chosen = load_description(sensor), CONFIGURATIONS[configuration]
-    check_scenes(chosen, folder, description)
-    if chosen.kind != "network":
-        steps = make_images(description, folder, jobs=jobs or -1)
-        _follow(steps, read_manifest(folder).scenes, "images of the scenes", folder)
     with Console(stderr=True).status(Text(f"reading {folder}")):
-        return prepare(chosen, folder, description, seed, start)
+        return prepare(CONFIGURATIONS[configuration], folder, description, seed, start)
 
 
 def _train(

@@ -1,6 +1,6 @@
-"""What training scenes are like: the paper's, and ones as hard as a real skin.
+"""What training scenes are like, as hard as a real skin; and the paper's test scenes.
 
-A preset draws a scene from a seed and its number. No seed of a training scene is one of the
+A scene is drawn from a seed and its number. No seed of a training scene is one of the
 evaluation's: the set's name is part of both.
 
 Lengths and pressures are those of a sheet of 150 mm whose response table ends at 300 kPa, the
@@ -10,7 +10,7 @@ paper's; on another sensor they scale with its shorter side and with its own tab
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 from tactomo_models.arrays import FloatArray
@@ -25,9 +25,6 @@ from tactomo_lab.scenes.drawing import (
     scale_of,
     seed_of,
 )
-
-PresetName = Literal["paper", "robust"]
-SCENES: Final[dict[PresetName, int]] = {"paper": 12_000, "robust": 24_000}  # of a whole set
 
 END_KPA = 300.0  # of the response table that the pressures below are for
 
@@ -76,31 +73,7 @@ class TrainingScene:
     presses: tuple[Press, ...]  #: what presses
     contrast: float  #: of the structure channel when saturated
     opposite: bool  #: whether the magnitude channel changes against the description's sign
-    #: errors of the magnitude and of the structure sheet; None where there are none
-    sheets: tuple[SheetErrors, SheetErrors] | None
-
-
-def draw_scene(
-    preset: PresetName, description: SensorDescription, seed: int, number: int
-) -> TrainingScene:
-    """Draw one scene of a preset.
-
-    Raises:
-        DataError: there is no room for so many contacts.
-    """
-    if preset == "paper":
-        return _paper(description, seed, number)
-    return _robust(description, seed, number)
-
-
-def _paper(description: SensorDescription, seed: int, number: int) -> TrainingScene:
-    """One to four ellipses on an even sheet, noise-free."""
-    assert description.magnitude is not None
-    rng = np.random.default_rng(seed_of("training", "paper", seed, number))
-    presses = paper_presses(description, rng, 1 + number % PAPER_CONTACTS)
-    # The paper's conductivity falls, whatever the sensor's does.
-    opposite = description.magnitude.response.sign > 0
-    return TrainingScene(presses, PAPER_CONTRAST, opposite, sheets=None)
+    sheets: tuple[SheetErrors, SheetErrors]  #: errors of the magnitude and the structure sheet
 
 
 def paper_presses(
@@ -128,8 +101,12 @@ def paper_presses(
     return placed_apart(description, count, 0.0, one)
 
 
-def _robust(description: SensorDescription, seed: int, number: int) -> TrainingScene:
-    """None to ten contacts of any form and pressure, on sheets as uneven as real ones."""
+def draw_scene(description: SensorDescription, seed: int, number: int) -> TrainingScene:
+    """Draw none to ten contacts of any form and pressure, on sheets as uneven as real ones.
+
+    Raises:
+        DataError: there is no room for so many contacts.
+    """
     rng = np.random.default_rng(seed_of("training", "robust", seed, number))
     skin = np.random.default_rng(seed_of("training", "robust skin", seed, number // SAME_SKIN))
     opposite = bool(skin.integers(2)) and can_be_opposite(description)

@@ -1,11 +1,11 @@
-"""Configurations: which network is trained on which scenes, how long, and how it is exported."""
+"""Configurations: which network is trained, how long, and how it is exported."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, cast
+from typing import Final
 
 import torch
 from tactomo_models.arrays import FloatArray
@@ -15,16 +15,14 @@ from tactomo_models.physics.artifact import load_or_build_artifact
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_protocol import Channel
-from torch import nn
 
 from tactomo_lab.scenes.measures import full_range
-from tactomo_lab.scenes.presets import PresetName
 from tactomo_lab.training.batches import SceneBatches
 from tactomo_lab.training.export import export, notes_of
-from tactomo_lab.training.networks import FusionNetwork, PaperNetwork
-from tactomo_lab.training.objectives import FusionObjective, PaperObjective, linear_images
-from tactomo_lab.training.train import Objective, Settings, Training, load_weights
-from tactomo_lab.training.training_scenes import read_manifest
+from tactomo_lab.training.networks import FusionNetwork
+from tactomo_lab.training.objectives import FusionObjective, linear_images
+from tactomo_lab.training.train import Settings, Training, load_weights
+from tactomo_lab.training.training_scenes import PRESET, read_manifest
 
 BOTH: Final[tuple[Channel, ...]] = (Channel.MAGNITUDE, Channel.STRUCTURE)
 
@@ -33,28 +31,17 @@ BOTH: Final[tuple[Channel, ...]] = (Channel.MAGNITUDE, Channel.STRUCTURE)
 class Configuration:
     """How a network is made."""
 
-    kind: str
-    preset: PresetName
     channels: tuple[Channel, ...]
     width: int
-    settings: Settings
-    hidden: int = 0
 
 
-# The paper: 200 epochs in batches of 128 at a constant rate of 1e-4, without turning the scenes.
-# Begun as a regression, at a rate that rises and falls, a tenth of that is enough.
-_PAPER = Settings(epochs=24, batch=64, rate=5e-4, weight_decay=0.0)
-
-_OURS = Settings(epochs=40, batch=64)
+KIND: Final = "network"
+SETTINGS: Final = Settings(epochs=40, batch=64)
 
 CONFIGURATIONS: Final[dict[str, Configuration]] = {
-    "ours": Configuration("network", "robust", BOTH, 24, _OURS),
-    "ours-small": Configuration("network", "robust", BOTH, 12, _OURS),
-    "ours-single": Configuration("network", "robust", (Channel.MAGNITUDE,), 24, _OURS),
-    "paper-single": Configuration(
-        "cnn-single", "paper", (Channel.MAGNITUDE,), 12, _PAPER, hidden=384
-    ),
-    "paper-multimodal": Configuration("cnn-multimodal", "paper", BOTH, 12, _PAPER, hidden=384),
+    "ours": Configuration(BOTH, 24),
+    "ours-small": Configuration(BOTH, 12),
+    "ours-single": Configuration((Channel.MAGNITUDE,), 24),
 }
 
 
@@ -64,29 +51,28 @@ class Prepared:
 
     configuration: Configuration
     description: SensorDescription
-    network: nn.Module
-    objective: Objective
+    network: FusionNetwork
+    objective: FusionObjective
     scale: float
-    bases: Mapping[Channel, FloatArray] | None = None
+    bases: Mapping[Channel, FloatArray]
 
 
-def check_scenes(
-    configuration: Configuration, folder: Path, description: SensorDescription
-) -> None:
-    """Refuse scenes that a configuration cannot use.
+def check_scenes(folder: Path, description: SensorDescription) -> None:
+    """Refuse scenes of another sensor.
 
     Raises:
-        ModelError: they are of another sensor or preset, or there are none.
+        ModelError: they are of another sensor, or of the preset `paper` of versions before; or
+            there are none.
     """
     manifest = read_manifest(folder)
     for name, there, needed in (
-        ("preset", manifest.preset, configuration.preset),
+        ("preset", manifest.preset, PRESET),
         ("sensor", manifest.sha256, description.sha256),
     ):
         if there != needed:
             raise ModelError(
-                f"{folder} holds scenes of {name} {there[:12]}, this configuration "
-                f"needs {needed[:12]}: name another folder, or simulate one"
+                f"{folder} holds scenes of {name} {there[:12]}, the network needs "
+                f"{needed[:12]}: name another folder, or simulate one"
             )
 
 
@@ -100,33 +86,22 @@ def prepare(
     """Read the scenes and make the network.
 
     Raises:
-        ModelError: the scenes are of another sensor or preset, or something is missing.
+        ModelError: the scenes are of another sensor, or something is missing.
     """
-    check_scenes(configuration, folder, description)
+    check_scenes(folder, description)
     torch.manual_seed(seed)
     scale = full_range(description)
-    if configuration.kind == "network":
-        there = tuple(name for name in configuration.channels if name in description.channels)
-        configuration = replace(configuration, channels=there)
-        forward = ForwardModel(description, load_or_build_artifact(description).bare)
-        batches = SceneBatches(folder, description, configuration.channels, forward)
-        network = FusionNetwork(batches.inputs, batches.nodes, configuration.width, scale)
-        bases = dict(zip(configuration.channels, batches.bases, strict=True))
-        if start is None:
-            network.start_linear(linear_images(batches, scale))
-        else:
-            load_weights(network, start)
-        return Prepared(configuration, description, network, FusionObjective(batches), scale, bases)
-    multimodal = len(configuration.channels) == 2
-    objective = PaperObjective(folder, description, multimodal=multimodal, scale=scale)
-    paper = PaperNetwork(
-        len(configuration.channels), objective.nodes, configuration.width, configuration.hidden
-    )
+    there = tuple(name for name in configuration.channels if name in description.channels)
+    configuration = replace(configuration, channels=there)
+    forward = ForwardModel(description, load_or_build_artifact(description).bare)
+    batches = SceneBatches(folder, description, configuration.channels, forward)
+    network = FusionNetwork(batches.inputs, batches.nodes, configuration.width, scale)
+    bases = dict(zip(configuration.channels, batches.bases, strict=True))
     if start is None:
-        objective.start_linear(paper)
+        network.start_linear(linear_images(batches, scale))
     else:
-        load_weights(paper, start)
-    return Prepared(configuration, description, paper, objective, scale)
+        load_weights(network, start)
+    return Prepared(configuration, description, network, FusionObjective(batches), scale, bases)
 
 
 def export_trained(prepared: Prepared, training: Training, path: Path) -> None:
@@ -135,22 +110,14 @@ def export_trained(prepared: Prepared, training: Training, path: Path) -> None:
     Raises:
         ModelError: the file cannot be written.
     """
-    configuration, objective = prepared.configuration, prepared.objective
-    further = {"trained": f"{len(training.history)} epochs, {objective.scenes} scenes"}
-    example: dict[str, torch.Tensor] = {}
-    if isinstance(objective, PaperObjective):
-        further["input_scale"] = repr(objective.input_scale)
-        for name in configuration.channels:
-            example[name] = torch.zeros(1, *objective.nodes)
-    else:
-        network = cast(FusionNetwork, training.averaged)
-        example["data"] = torch.zeros(1, network.inputs)
+    trained = f"{len(training.history)} epochs, {prepared.objective.scenes} scenes"
+    example = {"data": torch.zeros(1, prepared.network.inputs)}
     notes = notes_of(
-        configuration.kind,
+        KIND,
         prepared.description,
-        configuration.channels,
+        prepared.configuration.channels,
         prepared.scale,
         prepared.bases,
-        **further,
+        trained=trained,
     )
-    export(training.averaged.to("cpu"), example, outputs_of(configuration.kind), notes, path)
+    export(training.averaged.to("cpu"), example, outputs_of(KIND), notes, path)

@@ -80,7 +80,7 @@ def notes_of(
     description: SensorDescription,
     channels: tuple[Channel, ...],
     scale: float,
-    bases: Mapping[Channel, FloatArray] | None = None,
+    bases: Mapping[Channel, FloatArray],
     **further: str,
 ) -> dict[str, str]:
     """What a network's file says of itself.
@@ -90,7 +90,7 @@ def notes_of(
         description: the sensor.
         channels: channels it is given.
         scale: relative conductivity change that counts as 1 inside.
-        bases: (M, K) of the prefilter of each channel, for ours.
+        bases: (M, K) of the prefilter of each channel.
         further: whatever else is worth knowing.
     """
     notes = {
@@ -102,9 +102,7 @@ def notes_of(
         "scale": repr(scale),
         **further,
     }
-    if bases is not None:
-        packed = io.BytesIO()
-        singles: dict[str, Any] = {name: basis.astype(np.float32) for name, basis in bases.items()}
-        np.savez_compressed(packed, **singles)
-        notes["bases"] = b64encode(packed.getvalue()).decode()
-    return notes
+    packed = io.BytesIO()
+    singles: dict[str, Any] = {name: basis.astype(np.float32) for name, basis in bases.items()}
+    np.savez_compressed(packed, **singles)
+    return {**notes, "bases": b64encode(packed.getvalue()).decode()}

@@ -1,14 +1,11 @@
-"""The networks, in PyTorch: the paper's two, and ours.
+"""The network, in PyTorch.
 
-All give images of the map's size. What goes in front of them and what follows is the same in
-training and at run time: `prefilter` and `trained_networks` of `tactomo_models.methods`.
+What goes in front of it is the same in training and at run time: `prefilter` and
+`trained_networks` of `tactomo_models.methods`.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
-import numpy as np
 import torch
 from tactomo_models.arrays import FloatArray
 from torch import Tensor, nn
@@ -16,7 +13,7 @@ from torch.nn import functional as fn
 
 
 class FusionNetwork(nn.Module):
-    """Ours: from both channels' filtered voltages to the map, the pressed shape and a confidence.
+    """From both channels' filtered voltages to the map, the pressed shape and a confidence.
 
     One linear layer makes a coarse image of the voltages, as a reconstruction matrix does; a small
     perceptron sees what is not linear in them as a whole; a U-Net of two levels draws the edges.
@@ -114,112 +111,3 @@ class _Residual(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         return fn.relu(x + self.change(x))
-
-
-# Convolutions of each of an extractor's five stages, and what their channels are multiples of the
-# width. The paper says: sixteen blocks, five poolings, the last one averaging, 4096 numbers. That
-# takes 1024 channels of 2 x 2, from maps of 51 x 51 halved five times and rounded up; how blocks
-# and channels are spread over the stages it leaves open. Here only the last block is that wide.
-_STAGES = (3, 3, 3, 3, 4)
-_FEATURES = 4096
-# Standard deviations above 0 that the blocks' values begin at, where an ELU is nearly linear.
-# Through sixteen that are not, like images come out unlike: a regression on such features of 2,400
-# scenes errs by 0.64 of the maps; begun at 1, by 0.58.
-_START = 2.0
-
-
-class PaperNetwork(nn.Module):
-    """The paper's (section III-C): one extractor an input image, two fully connected blocks.
-
-    Args:
-        channels: 1, the magnitude image alone; 2, the structure image beside it.
-        nodes: (rows, columns) of the map.
-        width: channels of the first stage; doubled with every stage. 64 is the scale of VGG-19,
-            which has as many blocks and poolings; the paper leaves it open.
-        hidden: neurons between the two fully connected blocks; left open, too.
-    """
-
-    def __init__(
-        self, channels: int, nodes: tuple[int, int], width: int = 64, hidden: int = 4096
-    ) -> None:
-        super().__init__()
-        self.channels, self.nodes, self.width, self.hidden = channels, nodes, width, hidden
-        last = _FEATURES // int(np.prod([_halved(n, len(_STAGES)) for n in nodes]))
-        self.extractors = nn.ModuleList(_extractor(width, last) for _ in range(channels))
-        self.connected = nn.Sequential(
-            *_block(_FEATURES * channels, hidden), *_block(hidden, nodes[0] * nodes[1])
-        )
-
-    def forward(self, *images: Tensor) -> Tensor:
-        """From pre-processed images (n, rows, columns) to a 0-1 normalised one."""
-        made: Tensor = self.connected(self.features(*images)).view(-1, *self.nodes)
-        return made
-
-    def features(self, *images: Tensor) -> Tensor:
-        """What the extractors make of images (n, rows, columns): (n, 4096) of each, joined."""
-        made = zip(self.extractors, images, strict=True)
-        return torch.cat([extract(image[:, None]).flatten(1) for extract, image in made], dim=1)
-
-    def train(self, mode: bool = True) -> PaperNetwork:
-        """As PyTorch's, but the last normalisation keeps the statistics that it began with.
-
-        A node is pressed in few scenes of a batch: theirs would make its values noisy.
-        """
-        super().train(mode)
-        self.connected[-2].eval()
-        return self
-
-    def start_linear(self, features: Tensor, goals: Tensor, ridge: float = 6.0) -> None:
-        """Let the connected blocks begin as a ridge regression of maps on features.
-
-        Begun at random, they settle on the mean of all maps and leave it slowly: most of a map
-        is 0, where their last ReLU is silent.
-
-        Args:
-            features: (n, K) of the untrained extractors.
-            goals: (n, nodes) 0-1 normalised maps.
-            ridge: so many scenes' mean square of features is spread over all: few scenes tell less.
-        """
-        first, _, _, last, scale, _ = self.connected
-        centre, mean = features.mean(0), goals.mean(0)
-        apart = features - centre
-        gram = apart @ apart.T
-        damped = gram.double() + ridge * gram.trace() / len(gram) ** 2 * torch.eye(len(gram))
-        dual = torch.linalg.solve(damped, (goals - mean).double()).float()
-        # Each component takes two neurons, one for either sign: together they are linear.
-        _, sizes, components = torch.svd_lowrank(gram @ dual, self.hidden // 2, niter=4)
-        deviation = sizes / len(gram) ** 0.5
-        weight = (apart.T @ (dual @ components)) / deviation
-        back = components * deviation
-        typical = float((gram @ dual).std())
-        with torch.no_grad():
-            first.weight.copy_(torch.cat([weight, -weight], dim=1).T)
-            first.bias.copy_(-(first.weight @ centre))
-            last.weight.copy_(torch.cat([back, -back], dim=1) / typical)
-            last.bias.zero_()
-            scale.weight.fill_(typical)
-            scale.bias.copy_(mean)
-
-
-def _halved(nodes: int, times: int) -> int:
-    return nodes if times == 0 else _halved((nodes + 1) // 2, times - 1)
-
-
-def _extractor(width: int, last: int) -> nn.Sequential:
-    layers: list[Any] = []
-    inputs = 1
-    for stage, blocks in enumerate(_STAGES):
-        end = stage == len(_STAGES) - 1
-        for block in range(blocks):
-            outputs = last if end and block == blocks - 1 else width * 2**stage
-            normal = nn.BatchNorm2d(outputs)
-            nn.init.constant_(normal.bias, _START)
-            layers += [nn.Conv2d(inputs, outputs, 3, padding=1), normal, nn.ELU()]
-            inputs = outputs
-        pool = nn.AvgPool2d if end else nn.MaxPool2d
-        layers.append(pool(2, ceil_mode=True))
-    return nn.Sequential(*layers)
-
-
-def _block(inputs: int, outputs: int) -> list[nn.Module]:
-    return [nn.Linear(inputs, outputs), nn.BatchNorm1d(outputs), nn.ReLU()]

@@ -7,13 +7,15 @@ import pickle
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 from tactomo_models.archive import write_whole
 from tactomo_models.errors import ModelError
 from torch import Tensor, nn
+
+from tactomo_lab.training.objectives import FusionObjective
 
 AVERAGED = 0.998  # of the averaged weights that each step keeps
 
@@ -51,22 +53,6 @@ class Settings:
     seed: int = 0
     half: bool = True
     device: str = "cpu"
-
-
-class Objective(Protocol):
-    """What is trained: makes batches, and says how wrong the network's answer is."""
-
-    @property
-    def scenes(self) -> int:
-        """How many scenes there are to train on."""
-
-    def loss(
-        self, network: nn.Module, chosen: Tensor, random: torch.Generator, device: str
-    ) -> Tensor:
-        """Loss of some scenes, by their positions among those to train on."""
-
-    def examine(self, network: nn.Module, device: str) -> dict[str, float]:
-        """Measures on scenes that are not trained on."""
 
 
 @dataclass
@@ -112,7 +98,7 @@ def begin(network: nn.Module, settings: Settings) -> Training:
 
 def train(
     training: Training,
-    objective: Objective,
+    objective: FusionObjective,
     settings: Settings,
     checkpoint: Path | None = None,
     report: Callable[[int, int, float], None] = lambda step, steps, loss: None,
@@ -151,7 +137,7 @@ def train(
 
 
 def _step(
-    training: Training, objective: Objective, chosen: Tensor, settings: Settings, rate: float
+    training: Training, objective: FusionObjective, chosen: Tensor, settings: Settings, rate: float
 ) -> float:
     for group in training.optimiser.param_groups:
         group["lr"] = rate

@@ -38,7 +38,6 @@ from threadpoolctl import threadpool_limits
 
 from tactomo_lab.scenes.drawing import require_channels
 from tactomo_lab.scenes.presets import (
-    PresetName,
     SheetErrors,
     TrainingScene,
     draw_scene,
@@ -56,6 +55,7 @@ SPACING_SHARE = 5 / 6  # of the map's nodes' distance: 2.5 mm on the paper's sen
 REFINEMENTS = 2
 PARTS = 3  # that each side of a triangle is divided into, where its conductivity is averaged
 SCENES = "scenes"  # begins the names of the files that hold them
+PRESET = "robust"  # what scenes are drawn by; versions before had a second one
 FORMAT = 2  # raise it when what is drawn or simulated changes
 MANIFEST = "manifest.json"
 
@@ -88,13 +88,13 @@ class _Sheet:
     Attributes:
         mesh: with electrodes where they really are.
         conductivity: (T,) of each triangle, relative to the description's.
-        impedance: (L,) of its electrodes, likewise; all 1 if None.
+        impedance: (L,) of its electrodes, likewise.
         rest: (M,) volts while nothing presses.
     """
 
     mesh: SheetMesh
     conductivity: FloatArray
-    impedance: FloatArray | None
+    impedance: FloatArray
     rest: FloatArray
 
 
@@ -109,7 +109,7 @@ class SceneSimulator:
         require_channels(description, Channel.MAGNITUDE)
         self.description = description
         # Scenes in a row may have the same sheets.
-        self._sheets: dict[Channel, tuple[int | None, _Sheet]] = {}
+        self._sheets: dict[Channel, tuple[int, _Sheet]] = {}
 
     @cached_property
     def _mesh(self) -> SheetMesh:
@@ -131,8 +131,7 @@ class SceneSimulator:
             sensor = with_opposite_magnitude(sensor)
         made: dict[str, Any] = {}
         for index, name in enumerate(self.description.channels):
-            errors = scene.sheets[index] if scene.sheets else None
-            rest, change = self._channel(sensor, name, scene, errors)
+            rest, change = self._channel(sensor, name, scene, scene.sheets[index])
             made[f"{name}_rest"] = rest.astype(np.float32)
             made[f"{name}_change"] = change.astype(np.float32)
         truth = truth_of(sensor, scene.presses)
@@ -147,7 +146,7 @@ class SceneSimulator:
         sensor: SensorDescription,
         name: Channel,
         scene: TrainingScene,
-        errors: SheetErrors | None,
+        errors: SheetErrors,
     ) -> tuple[FloatArray, FloatArray]:
         """Volts at rest and relative changes of one channel."""
         sheet = self._sheet_of(name, errors)
@@ -157,28 +156,24 @@ class SceneSimulator:
         pressed = self._solve(sheet.mesh, sheet.conductivity * ratio, sheet.impedance)
         return sheet.rest, (pressed - sheet.rest) / np.abs(sheet.rest)
 
-    def _sheet_of(self, name: Channel, errors: SheetErrors | None) -> _Sheet:
+    def _sheet_of(self, name: Channel, errors: SheetErrors) -> _Sheet:
         """The last scene's sheet, if this one has the same."""
-        seed = errors.seed if errors else None
-        if name not in self._sheets or self._sheets[name][0] != seed:
-            self._sheets[name] = (seed, self._sheet(errors))
+        if name not in self._sheets or self._sheets[name][0] != errors.seed:
+            self._sheets[name] = (errors.seed, self._sheet(errors))
         return self._sheets[name][1]
 
-    def _sheet(self, errors: SheetErrors | None) -> _Sheet:
+    def _sheet(self, errors: SheetErrors) -> _Sheet:
         """A sheet with its errors, solved at rest."""
-        mesh, impedance = self._mesh, None
-        conductivity = np.ones(mesh.mesh.t.shape[1])
-        if errors is not None:
-            mesh = displaced(mesh, self.description, errors.displaced_m)
-            impedance = errors.impedance
-            x, y = mesh.mesh.p[:, mesh.mesh.t].mean(axis=1)
-            rng = np.random.default_rng(errors.seed)
-            field = smooth_noise(x, y, self.description.width_m / 4, rng)
-            conductivity = np.exp(errors.unevenness * field)
-        return _Sheet(mesh, conductivity, impedance, self._solve(mesh, conductivity, impedance))
+        mesh = displaced(self._mesh, self.description, errors.displaced_m)
+        x, y = mesh.mesh.p[:, mesh.mesh.t].mean(axis=1)
+        rng = np.random.default_rng(errors.seed)
+        field = smooth_noise(x, y, self.description.width_m / 4, rng)
+        conductivity = np.exp(errors.unevenness * field)
+        rest = self._solve(mesh, conductivity, errors.impedance)
+        return _Sheet(mesh, conductivity, errors.impedance, rest)
 
     def _solve(
-        self, mesh: SheetMesh, conductivity: FloatArray, impedance: FloatArray | None
+        self, mesh: SheetMesh, conductivity: FloatArray, impedance: FloatArray
     ) -> FloatArray:
         transfer = transfer_resistances(self.description, mesh, conductivity, impedance)
         return scan_voltages(self.description, transfer) * volts_per_unit(self.description)
@@ -206,13 +201,13 @@ def _parts() -> FloatArray:
 
 
 def simulate_shard(
-    description: SensorDescription, preset: PresetName, seed: int, first: int, size: int
+    description: SensorDescription, seed: int, first: int, size: int
 ) -> dict[str, Any]:
     """Simulate the `size` scenes of a shard that begins with scene `first`, on one thread."""
     simulator = SceneSimulator(description)
     with threadpool_limits(1):
         made = [
-            simulator.simulate(draw_scene(preset, description, seed, number))
+            simulator.simulate(draw_scene(description, seed, number))
             for number in range(first, first + size)
         ]
     return {key: np.stack([one[key] for one in made]) for key in made[0]}
@@ -225,7 +220,6 @@ def shard_path(folder: Path, first: int, what: str = SCENES) -> Path:
 
 def simulate(
     description: SensorDescription,
-    preset: PresetName,
     folder: Path,
     scenes: int,
     *,
@@ -239,16 +233,14 @@ def simulate(
 
     Raises:
         ModelError: the folder holds another set, a file cannot be written, or a process fails.
-        DataError: the sensor lacks a channel that the preset needs, or room for the contacts.
+        DataError: the sensor has no magnitude channel, or no room for the contacts.
         ModuleNotFoundError: joblib is not installed; it comes with tactomo-lab[train].
     """
     import joblib  # noqa: F401 - before anything is written
 
     SceneSimulator(description)  # refuses a sensor it cannot serve before anything is written
-    if preset == "paper":
-        require_channels(description, *Channel)
-    write_manifest(folder, _manifest(description, preset, seed, scenes))
-    make = partial(simulate_shard, description, preset, seed)
+    write_manifest(folder, _manifest(description, seed, scenes))
+    make = partial(simulate_shard, description, seed)
     yield from make_shards(folder, SCENES, shards_of(scenes), make, jobs=jobs)
 
 
@@ -311,12 +303,10 @@ def writing(path: Path) -> Iterator[Path]:
         ) from error
 
 
-def _manifest(
-    description: SensorDescription, preset: PresetName, seed: int, scenes: int
-) -> Manifest:
+def _manifest(description: SensorDescription, seed: int, scenes: int) -> Manifest:
     channels = description.model_dump_json(include={"magnitude", "structure"})
     responses = hashlib.sha256(channels.encode()).hexdigest()
-    return Manifest(FORMAT, preset, seed, description.name, description.sha256, scenes, responses)
+    return Manifest(FORMAT, PRESET, seed, description.name, description.sha256, scenes, responses)
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:

@@ -46,7 +46,7 @@ def whole(small: SensorDescription, tmp_path_factory: pytest.TempPathFactory) ->
     folder = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "SHARD", SHARD)
-        assert list(simulate(small, "robust", folder, SCENES, jobs=1)) == [0, 4, 4, 2]
+        assert list(simulate(small, folder, SCENES, jobs=1)) == [0, 4, 4, 2]
     return folder
 
 
@@ -60,7 +60,7 @@ def assert_same(one: Path, other: Path) -> None:
 def test_a_set_is_the_same_on_any_number_of_cores(
     small: SensorDescription, whole: Path, tmp_path: Path
 ) -> None:
-    assert sum(simulate(small, "robust", tmp_path / "two", SCENES, jobs=2)) == SCENES
+    assert sum(simulate(small, tmp_path / "two", SCENES, jobs=2)) == SCENES
     assert_same(tmp_path / "two", whole)
     scenes = read_scenes(whole)
     assert scenes["magnitude_change"].shape == (SCENES, small.measurements)
@@ -75,10 +75,10 @@ def test_what_is_missing_or_damaged_is_made_anew_and_nothing_else(
     cut.write_bytes(cut.read_bytes()[:-100])
     (folder / ".scenes-0000000.npz.123.part").write_bytes(b"half of it")
     before = kept.stat().st_mtime_ns
-    assert list(simulate(small, "robust", folder, SCENES, jobs=1)) == [2, 4, 4]
+    assert list(simulate(small, folder, SCENES, jobs=1)) == [2, 4, 4]
     assert kept.stat().st_mtime_ns == before
     assert_same(folder, whole)
-    assert list(simulate(small, "robust", folder, SCENES, jobs=1)) == [SCENES]
+    assert list(simulate(small, folder, SCENES, jobs=1)) == [SCENES]
 
 
 def test_flipped_bits_are_found(small: SensorDescription, folder: Path, whole: Path) -> None:
@@ -89,17 +89,17 @@ def test_flipped_bits_are_found(small: SensorDescription, folder: Path, whole: P
     file.write_bytes(content)
     with pytest.raises(ModelError, match=r"damaged.*makes damaged files anew"):
         read_scenes(folder)
-    assert list(simulate(small, "robust", folder, SCENES, jobs=1)) == [6, 4]
+    assert list(simulate(small, folder, SCENES, jobs=1)) == [6, 4]
     assert_same(folder, whole)
 
 
 def test_a_set_grows_and_shrinks(small: SensorDescription, folder: Path, whole: Path) -> None:
     """Scenes that are there stay: those of the last, half full shard are made again."""
-    assert list(simulate(small, "robust", folder, 12, jobs=1)) == [8, 4]
+    assert list(simulate(small, folder, 12, jobs=1)) == [8, 4]
     assert len(read_scenes(folder)["map"]) == 12
-    assert list(simulate(small, "robust", folder, 6, jobs=1)) == [6]
+    assert list(simulate(small, folder, 6, jobs=1)) == [6]
     assert len(read_scenes(folder)["map"]) == 6
-    assert list(simulate(small, "robust", folder, SCENES, jobs=1)) == [SCENES]
+    assert list(simulate(small, folder, SCENES, jobs=1)) == [SCENES]
     assert_same(folder, whole)
 
 
@@ -107,7 +107,6 @@ def test_a_set_grows_and_shrinks(small: SensorDescription, folder: Path, whole: 
     ("what", "change"),
     [
         ("seed", {"seed": 1}),
-        ("preset", {"preset": "paper"}),
         ("sha256", {"description": {"sheet": {"conductivity_s_m": 2.0}}}),
         ("responses", {"description": {"structure": {"conductivity_ratio": 50.0}}}),
     ],
@@ -116,14 +115,7 @@ def test_another_set_in_the_folder_is_refused(
     small: SensorDescription, folder: Path, whole: Path, what: str, change: dict[str, Any]
 ) -> None:
     description = variant(small, **change.get("description", {}))
-    steps = simulate(
-        description,
-        change.get("preset", "robust"),
-        folder,
-        SCENES,
-        seed=change.get("seed", 0),
-        jobs=1,
-    )
+    steps = simulate(description, folder, SCENES, seed=change.get("seed", 0), jobs=1)
     with pytest.raises(ModelError, match=rf"another {what}, .*choose another folder, or delete"):
         list(steps)
     assert_same(folder, whole)
@@ -132,7 +124,7 @@ def test_another_set_in_the_folder_is_refused(
 def test_a_damaged_manifest_is_told(small: SensorDescription, folder: Path) -> None:
     (folder / "manifest.json").write_text('{"format": 1, "pre')
     with pytest.raises(ModelError, match=r"manifest\.json is damaged .*delete the folder"):
-        list(simulate(small, "robust", folder, SCENES, jobs=1))
+        list(simulate(small, folder, SCENES, jobs=1))
 
 
 def test_a_set_that_is_not_complete_is_not_read(folder: Path, tmp_path: Path) -> None:
@@ -145,14 +137,14 @@ def test_a_set_that_is_not_complete_is_not_read(folder: Path, tmp_path: Path) ->
 
 def test_a_sensor_without_a_magnitude_channel_leaves_no_folder(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="has no magnitude channel"):
-        list(simulate(load_description("tank_disc"), "robust", tmp_path / "new", SCENES))
+        list(simulate(load_description("tank_disc"), tmp_path / "new", SCENES))
     assert not (tmp_path / "new").exists()
 
 
 def test_a_folder_that_cannot_be_written_is_told(small: SensorDescription, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ModelError, match=r"cannot write .*: Not a directory; free some space"):
-        list(simulate(small, "robust", tmp_path / "file" / "scenes", SCENES, jobs=1))
+        list(simulate(small, tmp_path / "file" / "scenes", SCENES, jobs=1))
 
 
 @contextmanager
@@ -175,7 +167,7 @@ def test_a_full_disk_is_told_and_leaves_no_half_shard(
         pytest.raises(ModelError, match=r"cannot write .*npz: File too large; free some space"),
         full_disk(),
     ):
-        list(simulate(small, "robust", tmp_path, SCENES, jobs=1))
+        list(simulate(small, tmp_path, SCENES, jobs=1))
     assert [file.name for file in tmp_path.iterdir()] == ["manifest.json"]
 
 
@@ -187,7 +179,7 @@ def test_a_killed_process_is_told(
 
     monkeypatch.setattr(module, "simulate_shard", killed)
     with pytest.raises(ModelError, match=r"was killed.*with fewer jobs"):
-        list(simulate(small, "robust", tmp_path, SCENES, jobs=2))
+        list(simulate(small, tmp_path, SCENES, jobs=2))
 
 
 class TestCommand:
@@ -198,14 +190,13 @@ class TestCommand:
         part = tactomo(*command, "--scenes", 4, "--json")
         assert json.loads(part.stdout) == {
             "folder": "scenes",
-            "preset": "robust",
             "seed": 0,
             "sensor": "small",
             "scenes": 4,
             "new": 4,
         }
         rest = tactomo(*command, "--scenes", SCENES)
-        assert (rest.returncode, rest.stdout) == (0, "scenes: 10 robust scenes, 6 of them new\n")
+        assert (rest.returncode, rest.stdout) == (0, "scenes: 10 scenes, 6 of them new\n")
         assert_same(tmp_path / "scenes", whole)
 
     def test_ctrl_c_leaves_whole_shards_and_says_how_to_go_on(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -13,15 +13,9 @@ import numpy as np
 import pytest
 import torch
 from small_sensor import SMALL
-from tactomo_lab.baselines import paper_network
-from tactomo_lab.baselines.paper_network import preprocessed
 from tactomo_lab.commands.training import ConfigurationName
-from tactomo_lab.scenes.presets import PresetName
 from tactomo_lab.training.batches import Batch, SceneBatches
 from tactomo_lab.training.configurations import CONFIGURATIONS, Prepared, export_trained, prepare
-from tactomo_lab.training.networks import PaperNetwork
-from tactomo_lab.training.objectives import PaperObjective, correlations
-from tactomo_lab.training.preliminary import make_images, read_images
 from tactomo_lab.training.train import (
     Settings,
     Training,
@@ -32,7 +26,6 @@ from tactomo_lab.training.train import (
 )
 from tactomo_lab.training.training_scenes import simulate
 from tactomo_models import (
-    DataError,
     ModelError,
     SensorDescription,
     load_description,
@@ -50,7 +43,6 @@ pytestmark = pytest.mark.train
 Run = Callable[..., Any]
 
 SCENES = 50
-PAPER_SCENES = 24
 TINY = Settings(epochs=2, batch=16, seed=3)
 
 
@@ -67,24 +59,15 @@ def square(square_file: Path) -> SensorDescription:
     return load_description(square_file)
 
 
-def simulated(
-    preset: PresetName, scenes: int, description: SensorDescription, factory: Any
-) -> Path:
-    folder: Path = factory.mktemp(preset)
-    assert sum(simulate(description, preset, folder, scenes, jobs=1)) == scenes
+def simulated(scenes: int, description: SensorDescription, factory: Any) -> Path:
+    folder: Path = factory.mktemp("scenes")
+    assert sum(simulate(description, folder, scenes, jobs=1)) == scenes
     return folder
 
 
 @pytest.fixture(scope="session")
 def robust(square: SensorDescription, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return simulated("robust", SCENES, square, tmp_path_factory)
-
-
-@pytest.fixture(scope="session")
-def paper(square: SensorDescription, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = simulated("paper", PAPER_SCENES, square, tmp_path_factory)
-    assert sum(make_images(square, folder, jobs=1)) == PAPER_SCENES
-    return folder
+    return simulated(SCENES, square, tmp_path_factory)
 
 
 @pytest.fixture(scope="session")
@@ -125,14 +108,12 @@ def test_a_network_of_one_sheet_sees_that_sheet(
     square: SensorDescription, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     alone = variant(square, structure=None)
-    folder = simulated("robust", 20, alone, tmp_path_factory)
+    folder = simulated(20, alone, tmp_path_factory)
     prepared = prepare(replace(CONFIGURATIONS["ours"], width=6), folder, alone)
     training = begun(prepared)
     assert len(list(train(training, prepared.objective, replace(TINY, epochs=1)))) == 1
     export_trained(prepared, training, file := folder / "network.onnx")
     assert load_network(alone, "network", file).channels == ("magnitude",)
-    with pytest.raises(DataError, match="no structure channel"):
-        next(simulate(alone, "paper", folder / "paper", 20, jobs=1))
 
 
 def test_training_learns(ours: Prepared) -> None:
@@ -206,54 +187,6 @@ class TestExported:
         export_trained(ours, begun(ours), path)
         with pytest.raises(ModelError, match=r"is no checkpoint.*name another"):
             prepare(CONFIGURATIONS["ours"], robust, square, start=path)
-
-    @pytest.mark.parametrize("configuration", ["paper-single", "paper-multimodal"])
-    def test_the_papers(
-        self, configuration: str, paper: Path, square: SensorDescription, tmp_path: Path
-    ) -> None:
-        settings = Settings(epochs=1, batch=8)
-        narrow = replace(CONFIGURATIONS[configuration], width=2, hidden=16, settings=settings)
-        prepared = prepare(narrow, paper, square)
-        training = begin(prepared.network, settings)
-        (epoch,) = train(training, prepared.objective, settings)
-        assert np.isfinite(epoch.loss)
-        export_trained(prepared, training, tmp_path / "paper.onnx")
-        network = Network(tmp_path / "paper.onnx", square, narrow.kind)
-        assert network.channels == narrow.channels
-        whole = read_images(paper)
-        largest = float(whole["magnitude"][: prepared.objective.scenes].max())
-        images: Mapping[Any, Any] = {
-            name: whole[name][0].astype(np.float32) for name in narrow.channels
-        }
-        ready = preprocessed(images, largest)
-        with torch.inference_mode():
-            expected = training.averaged(*(torch.as_tensor(one)[None] for one in ready.values()))
-        np.testing.assert_allclose(network.run(ready)["map"], expected[0].numpy(), atol=5e-3)
-        assert paper_network.PaperNetwork(network).image(images).shape == (21, 21)
-
-
-def test_the_papers_network_begins_as_a_regression() -> None:
-    """Begun at random, it settles on the mean of all maps: silent everywhere."""
-    random = torch.Generator().manual_seed(0)
-    scenes, features, maps = (
-        torch.randn(n, generator=random) for n in ((300, 5), (5, 8192), (5, 441))
-    )
-    goals = 20 + scenes @ maps  # nowhere below 0, where the last ReLU is silent
-    network = PaperNetwork(2, (21, 21), width=2, hidden=16).train()
-    network.start_linear(scenes @ features, goals)
-    with torch.inference_mode():
-        made = network.connected(scenes @ features)
-    assert torch.square(made - goals).mean() < 0.02 * goals.var(0).mean()
-
-
-def test_images_are_turned_as_their_maps_are(paper: Path, square: SensorDescription) -> None:
-    objective = PaperObjective(paper, square, multimodal=True, scale=0.25)
-    scenes = torch.zeros(24, dtype=torch.int64)
-    images, maps = objective.draw(scenes, torch.Generator().manual_seed(0))
-    assert len({one.numpy().tobytes() for one in maps}) == 8
-    for image in images:
-        alike = correlations(image, maps)
-        assert torch.allclose(alike, alike[:1], atol=1e-5)
 
 
 def test_permuted_electrodes_are_a_turned_scene(ours: Prepared, square: SensorDescription) -> None:
@@ -333,19 +266,16 @@ class TestCommand:
         assert not SensorNetworks(description).missing
 
     def test_wrong_scenes_are_told(
-        self, tactomo: Run, robust: Path, paper: Path, square_file: Path, tmp_path: Path
+        self, tactomo: Run, robust: Path, square_file: Path, tmp_path: Path
     ) -> None:
-        sensor = ("--description", square_file)
-        for folder, configuration, said in (
-            (
-                robust,
-                "paper-single",
-                "holds scenes of preset robust, this configuration needs paper",
-            ),
-            (paper, "ours", "holds scenes of preset paper, this configuration needs robust"),
-            (tmp_path, "ours", "holds no simulated scenes; make some: tactomo models simulate"),
+        manifest = (robust / "manifest.json").read_text()
+        (tmp_path / "old").mkdir()
+        (tmp_path / "old" / "manifest.json").write_text(manifest.replace('"robust"', '"paper"'))
+        for folder, said in (
+            (tmp_path / "old", "holds scenes of preset paper, the network needs robust"),
+            (tmp_path, "holds no simulated scenes; make some: tactomo models simulate"),
         ):
-            result = tactomo("models", "train", folder, "--configuration", configuration, *sensor)
+            result = tactomo("models", "train", folder, "--description", square_file)
             assert result.returncode == 1
             assert said in result.stderr
         result = tactomo("models", "train", robust)

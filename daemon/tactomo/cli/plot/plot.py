@@ -115,17 +115,6 @@ def picture_option(words: str) -> Any:
     return typer.Option(help=f"{words}: .png, .svg or .pdf. Needs matplotlib.", callback=prepared)
 
 
-def prepare_folder(folder: Path) -> None:
-    """Make sure before the work that pictures can be drawn into a folder, which is made.
-
-    Raises TactomoError as `prepare_picture` does, or where the folder cannot be made.
-    """
-    step = "give one that you may write"
-    with os_errors_as(TactomoError, f"cannot make the folder {folder}", step):
-        folder.mkdir(parents=True, exist_ok=True)
-    prepare_picture(folder / "figure.png")
-
-
 def prepare_file(output: Path, *, force: bool = True, source: Path | None = None) -> None:
     """Make sure before the work that a file can be written; what it holds stays as it is.
 
