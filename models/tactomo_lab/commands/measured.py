@@ -1,8 +1,8 @@
-"""`tactomo evaluate measured`, `ktc` and `presses`: measured sets, and what others say of them."""
+"""`tactomo evaluate measured`, `ktc` and `presses`: measured sets."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -21,43 +21,29 @@ if TYPE_CHECKING:
 
 app = typer_app()
 
-BEGIN: Final = "<!-- from here on by `tactomo evaluate measured`"
-END: Final = "<!-- to here -->"
 TRAINED: Final = (100, 200, 800)  # presses learnt from
 
 
 class Measured(NamedTuple):
-    """What a set shows: the figure of its row, tables with their captions, all for programs."""
+    """What a set shows: its figure, tables with their captions, all for programs."""
 
     ours: str
     details: list[str]
     facts: dict[str, Any]
 
 
-class PublicSet(NamedTuple):
-    """A set that a reader can get.
+class Kind(NamedTuple):
+    """A kind of measured sets.
 
     Attributes:
-        file: what it is called.
-        arrays: what sets of its kind are recognised by: how their arrays' names end.
-        description: the shipped sensor that it is of; nothing where none has to be known.
-        title: what it is.
-        command: what measures it, behind `tactomo evaluate`.
-        measure: the same, as a function of the path and the sensor.
-        published: the best figure of others, with who says so; or a plain method's.
-        apart: what is not comparable.
-        source: where the raw data are.
+        arrays: what sets of the kind are recognised by: how their arrays' names end.
+        description: the shipped sensor that public sets are of; nothing where none has to be known.
+        measure: what measures a set, of its path and its sensor.
     """
 
-    file: str
     arrays: tuple[str, ...]
     description: str
-    title: str
-    command: str
     measure: Callable[[Path, str], Measured]
-    published: str
-    apart: str
-    source: str
 
 
 def challenge(path: Path, sensor: str) -> Measured:
@@ -174,79 +160,33 @@ def soft_skins(path: Path, sensor: str) -> Measured:
     )
 
 
-SETS: Final = (
-    PublicSet(
-        "ktc2023_training.npz",
-        ("injection", "measurement", "reference", "voltages", "truth"),
-        "tank_ktc2023",
-        "Kuopio Tomography Challenge 2023, 32 electrodes, sum of scores",
-        "ktc FILE --level 1, to 7",
-        challenge,
-        "winner 15.24, other entries 12 to 15, the organisers' own 10.30 (the challenge's results)",
-        "theirs are of 21 tanks that were kept back, three at each level; ours of the four "
-        "training tanks at each level (mean × 21), which hold one or two objects and are easier",
-        "[its public data](http://fips.fi/KTCrules.php)",
-    ),
-    PublicSet(
-        "tank_uef2017.npz",
-        ("dv", "truth", "name"),
-        "tank_uef2017",
-        "University of Eastern Finland 2017, saline tanks of 16 electrodes, mean correlation",
-        "measured FILE",
-        saline_tanks,
-        "one-step NOSER 0.76 over the whole set; no published correlation was found",
-        "the whole set has more tanks",
-        "[Hauptmann et al. 2017](https://arxiv.org/abs/1704.01178)",
-    ),
-    PublicSet(
-        "skin_round_presses.npz",
-        ("lookup", "dv", "pos_m"),
-        "skin_round",
-        "Round e-skin of 80 mm (Hardman), 1250 robot presses",
-        "measured FILE",
-        round_skin,
-        "none was found for these presses",
-        "",
-        "[DSHardman/Variable-Sensitivity-E-Skins](https://github.com/DSHardman/Variable-Sensitivity-E-Skins)",
-    ),
-    PublicSet(
-        "skins_anisotropy.npz",
-        ("_voltages", "_xy_mm"),
-        "",
-        "Five soft skins of 80 mm (Hardman), learnt from the first 800 presses of each, judged on "
-        "the last 800",
-        "presses FILE --train 800",
-        soft_skins,
-        "the authors' networks 4 to 11 mm; plain kernel ridge regression 3.0 mm",
-        "the authors' were taught by about 2,000 presses, and are of other skins, too",
-        "[DSHardman/Anisotropy](https://github.com/DSHardman/Anisotropy)",
-    ),
+KINDS: Final = (
+    Kind(("injection", "measurement", "reference", "voltages", "truth"), "tank_ktc2023", challenge),
+    Kind(("dv", "truth", "name"), "tank_uef2017", saline_tanks),
+    Kind(("lookup", "dv", "pos_m"), "skin_round", round_skin),
+    Kind(("_voltages", "_xy_mm"), "", soft_skins),
 )
 
 
 @app.command(
     epilog=examples(
-        "tactomo evaluate measured data/",
-        "tactomo evaluate measured data/ --into docs/measured.md",
+        "tactomo evaluate measured tank_uef2017.npz",
         "tactomo evaluate measured my_tanks.npz -d my_tank.toml --json",
     )
 )
 def measured(
     path: Annotated[
-        Path, typer.Argument(metavar="DIR|FILE.npz", help="Where sets lie, or one of your own.")
+        Path, typer.Argument(metavar="FILE.npz", help="A public set, or one of your own.")
     ],
-    into: Annotated[
-        Path | None, typer.Option(help="A page to put DIR's tables into, between its two marks.")
-    ] = None,
     sensor: Annotated[
         str | None,
         typer.Option("--description", "-d", help="Sensor of FILE. [the public set's]"),
     ] = None,
     as_json: JsonOutput = False,
 ) -> None:
-    """Evaluate a measured set, or the public sets in DIR beside the best published figures.
+    """Evaluate a measured set; prints Markdown.
 
-    Prints Markdown. The arrays of FILE tell its kind. *Tanks with objects*: `dv` (n, M), the
+    The arrays of FILE tell its kind. *Tanks with objects*: `dv` (n, M), the
     increase of each voltage by the objects, on one unknown scale common to all; `truth` (n, rows,
     columns), 1 where an object conducts better than the saline and -1 where worse, row 0 at the
     top, the disc filling the picture; `name` (n,). The figure is the Pearson correlation of the
@@ -258,90 +198,38 @@ def measured(
     and 800 presses.
 
     The public sets are ktc2023_training.npz, tank_uef2017.npz, skin_round_presses.npz and
-    skins_anisotropy.npz; the table names missing sets. All four take two minutes of one core.
+    skins_anisotropy.npz; docs/measured.md has the best published figures beside ours. All four
+    take two minutes of one core.
     """
-    if not path.is_dir():
-        if into is not None:
-            raise typer.BadParameter("--into goes with a folder")
-        found = _measure(path, _recognised(path), sensor)
-        lines = [f"{path.name}: {found.ours}", "", *found.details]
-        _tell({path.name: found}, "\n".join(lines), as_json)
-        return
-    if sensor is not None:
-        raise typer.BadParameter("--description goes with one file")
-    before, after = ("", "") if into is None else _around(into)
-    there = [each for each in SETS if (path / each.file).exists()]
-    if not there:
-        names = ", ".join(each.file for each in SETS)
-        raise TactomoError(f"{path} holds none of the sets", f"put some there: {names}")
-    sets = {each.file: _measure(path / each.file, each, None) for each in there}
-    text = "\n".join(_page(sets)) + "\n"
-    if into is None:
-        _tell(sets, text, as_json)
-        return
-    from tactomo_models.archive import write_whole
-
-    page = before + text + after
-    write_whole(into, lambda file: file.write(page.encode()))
-    say(f"wrote {into}", err=True)
-
-
-def _tell(sets: dict[str, Measured], text: str, as_json: bool) -> None:
-    told = {"simulated": False, "sets": {name: one.facts for name, one in sets.items()}}
-    tell(told, as_json, lambda _: say(text))
-
-
-def _measure(path: Path, kind: PublicSet, sensor: str | None) -> Measured:
     from threadpoolctl import threadpool_limits
 
+    kind = _recognised(path)
     if sensor is not None and not kind.description:
         raise typer.BadParameter("--description: presses alone are learnt from; leave it out")
     say(f"measuring {path.name}", err=True)
     with threadpool_limits(1):  # more threads wait for each other where others compute, too
-        return kind.measure(path, sensor or kind.description)
+        found = kind.measure(path, sensor or kind.description)
+    text = "\n".join([f"{path.name}: {found.ours}", "", *found.details])
+    told = {"simulated": False, "sets": {path.name: found.facts}}
+    tell(told, as_json, lambda _: say(text))
 
 
-def _recognised(path: Path) -> PublicSet:
-    """Return the public set that a file has the arrays of.
+def _recognised(path: Path) -> Kind:
+    """Return the kind that a file has the arrays of.
 
     Raises TactomoError where the file cannot be read, or has the arrays of none.
     """
     from tactomo_lab.evaluation.measured_sets import read_set
 
     names = list(read_set(path, "measured scans"))
-    for each in SETS:
+    for each in KINDS:
         if all(any(name.endswith(array) for name in names) for array in each.arrays):
             return each
-    known = "; ".join(", ".join(each.arrays) for each in SETS)
+    known = "; ".join(", ".join(each.arrays) for each in KINDS)
     raise TactomoError(
         f"{path} is no set of measured scans: it holds {', '.join(names) or 'nothing'}",
         f"give the arrays of one: {known}",
     )
-
-
-def _around(page: Path) -> tuple[str, str]:
-    """Return what is on a page up to the mark where tables begin, and from where they end."""
-    try:
-        before, begin, rest = page.read_text("utf-8").partition(BEGIN)
-    except OSError as error:
-        raise TactomoError(f"cannot read {page}: {error.strerror}", "give a page") from error
-    mark, _, tables = rest.partition("\n")
-    if not begin or END not in tables:
-        raise TactomoError(f"{page} has no marks", f"put {BEGIN} --> and {END} on lines of it")
-    return f"{before}{begin}{mark}\n", tables[tables.index(END) :]
-
-
-def _page(found: dict[str, Measured]) -> Iterator[str]:
-    heads = ["set", "`tactomo evaluate`", "ours", "published, or a plain method", "not comparable"]
-    rows = []
-    for each in SETS:
-        ours = found[each.file].ours if each.file in found else "not here"
-        row = [f"{each.title}: {each.source}", f"`{each.command}`", ours, each.published]
-        rows.append([*row, each.apart])
-    yield from _table(heads, rows)
-    for each in SETS:
-        if each.file in found:
-            yield from (f"## {each.file}", "", "\n".join(found[each.file].details).rstrip(), "")
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

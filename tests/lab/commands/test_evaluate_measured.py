@@ -10,9 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from simulated_tanks import simulated_tanks
-from tactomo_lab.commands.measured import BEGIN, END, SETS
 from tactomo_models import load_description
-from whole_system import repository
 
 Run = Callable[..., Any]
 
@@ -86,8 +84,6 @@ def test_a_file_that_is_none(tactomo: Run, tmp_path: Path, command: str) -> None
     [
         (("tanks.npz", "-d", "paper_square"), "is no round tank"),
         (("skins.npz", "-d", "paper_square"), "leave it out"),
-        (("tanks.npz", "--into", "page.md"), "goes with a folder"),
-        ((".", "-d", "tank_uef2017"), "goes with one file"),
     ],
 )
 def test_what_does_not_go_together_is_refused_before_the_work(
@@ -102,39 +98,15 @@ def test_what_does_not_go_together_is_refused_before_the_work(
 
 
 @pytest.mark.slow
-def test_a_page_of_the_sets_that_are_there(tactomo: Run, tmp_path: Path) -> None:
-    """Of presses on a skin whose voltages are linear in the place; the other sets are missing."""
+def test_presses_of_unknown_skins(tactomo: Run, tmp_path: Path) -> None:
+    """Whose voltages are linear in the place."""
     rng = np.random.default_rng(0)
     xy_mm = rng.uniform(-40, 40, (816, 2))
     volts = np.hstack([xy_mm, np.full((816, 1), 50.0)]) @ rng.normal(size=(3, 12))
     volts += 0.3 * rng.normal(size=volts.shape)
-    empty = tactomo("evaluate", "measured", tmp_path)
-    assert (empty.returncode, "put some there: ktc2023" in empty.stderr) == (1, True)
-    np.savez(tmp_path / "skins_anisotropy.npz", a_voltages=volts, a_xy_mm=xy_mm)
-    page = tmp_path / "page.md"
-    page.write_text("no marks\n")
-    asked = ("evaluate", "measured", tmp_path, "--into", page)
-    assert "has no marks" in tactomo(*asked).stderr
-    ends = BEGIN + " -->\n", END + "\nafter\n"
-    page.write_text("before\n" + ends[0] + "stale figures\n" + ends[1])
-    result = tactomo(*asked)
+    np.savez(tmp_path / "skins.npz", a_voltages=volts, a_xy_mm=xy_mm)
+    result = tactomo("evaluate", "measured", tmp_path / "skins.npz")
     assert result.returncode == 0, result.stderr
-    said = page.read_text()
-    assert said.startswith("before\n" + ends[0])
-    assert said.endswith(ends[1])
-    assert "stale" not in said
-    assert "\n\n\n" not in said
-    rows = [line.strip("| ").split(" | ") for line in said.splitlines() if line.startswith("|")]
-    assert [row[2] for row in rows[2:5]] == ["not here"] * 3
-    median = float(rows[5][2].split()[0])
-    assert median < 3
-    assert rows[-1][0] == "800"
-    assert float(rows[-1][-1]) == median
+    rows = [line.strip("| ").split(" | ") for line in result.stdout.splitlines() if "|" in line]
     assert [row[0] for row in rows[-3:]] == ["100", "200", "800"]
-
-
-def test_the_page_in_docs_can_be_made_again() -> None:
-    text = (repository() / "docs" / "measured.md").read_text()
-    assert text.count(BEGIN) == text.count(END) == 1
-    between = text[text.index(BEGIN) : text.index(END)]
-    assert all(f"## {each.file}\n" in between and each.published in between for each in SETS)
+    assert float(rows[-1][-1]) < 3
