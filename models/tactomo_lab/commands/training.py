@@ -1,4 +1,4 @@
-"""`tactomo models simulate`, `train` and `train-tanks`: scenes to learn from, and the networks."""
+"""`tactomo models simulate` and `train`: scenes to learn from, and the network."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ EXTRA = (
     "see https://pytorch.org/get-started"
 )
 INTERRUPTED = 130
-FEWEST_TANKS = 250  # a shard of them
 
 # The models' CONFIGURATIONS, which are not imported for a command line that only shows its help.
 ConfigurationName: TypeAlias = Literal["ours", "ours-small", "ours-single"]
@@ -163,49 +162,6 @@ def train(
         print_json({**told, **asdict(settings), "history": history})
     else:
         say(f"wrote {written}: {written.stat().st_size / 1e6:.1f} MB")
-
-
-@app.command(
-    name="train-tanks",
-    epilog=examples(
-        "tactomo models train-tanks tanks", "tactomo models train-tanks tanks --jobs 4"
-    ),
-)
-def train_tanks(
-    folder: Annotated[Path, typer.Argument(help="Folder for the scenes; made if missing.")],
-    scenes: Annotated[int, typer.Option(min=FEWEST_TANKS, help="How many tanks.")] = 2500,
-    steps: Annotated[int, typer.Option(min=20, help="Batches of twenty.")] = 3600,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of weights, noise and turns.")] = 0,
-    jobs: Annotated[
-        int | None, typer.Option(min=1, help="Processes. [one for each core]", show_default=False)
-    ] = None,
-    output: Annotated[Path, typer.Option("--output", "-o", help="The network.")] = Path(
-        "tank.onnx"
-    ),
-) -> None:
-    """Simulate round tanks, and train the network that `tactomo evaluate ktc` and `measured` use.
-
-    Tanks hold one to four objects of either kind and of many outlines; the network gets voltages of
-    32 electrodes, none to twelve of them lost, and of 16 electrodes. Existing scenes are not
-    simulated again. Simulation takes three minutes, training a quarter of an hour on one core; the
-    shipped network was made so. Needs `pip install 'tactomo-lab[train]'`.
-    """
-    with needs("training", EXTRA):
-        from tactomo_lab.training.tank_network import train as train_network
-        from tactomo_lab.training.tank_scenes import SHARD, simulate_shard
-        from tactomo_lab.training.train import use
-        from tactomo_lab.training.training_scenes import make_shards
-
-        use("cpu", jobs)
-        folder.mkdir(parents=True, exist_ok=True)
-        shards = [(first, SHARD) for first in range(0, scenes - SHARD + 1, SHARD)]
-        made = make_shards(folder, "tanks", shards, simulate_shard, jobs=jobs or -1)
-        _follow(made, len(shards) * SHARD, "tanks", folder)
-        with _progress() as shown:
-            task = shown.add_task("training", total=steps)
-            for loss in train_network(folder, steps, output, seed):
-                shown.update(task, advance=1, description=f"training, loss {loss:.4f}")
-    say(f"wrote {output}: {output.stat().st_size / 1e6:.1f} MB")
 
 
 def _prepare(

@@ -12,25 +12,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from tactomo_models.arrays import BoolArray, FloatArray, Image
 
-ELECTRODES = 32
 WINDOW = 80  # pixels, standard deviation of the score's window; it ends at twice that
 C1, C2 = 1e-4, 9e-4
-AGAINST = (0, 8, 16, 24)  # electrodes by which the currents of the others leave
-
-
-def challenge_pattern() -> tuple[FloatArray, FloatArray]:
-    """Unit currents and weights (2356, 32) of all readings, the currents changing last.
-
-    Every second electrode drives: with the next of these, and with each of four; neighbours are
-    measured.
-    """
-    driven = range(0, ELECTRODES, 2)
-    pairs = [(i, (i + 2) % ELECTRODES) for i in driven]
-    pairs += [(i, j) for j in AGAINST for i in driven if i != j]
-    eye = np.eye(ELECTRODES)
-    drive = np.array([eye[i] - eye[j] for i, j in pairs])
-    measure = np.array([eye[i] - eye[i + 1] for i in range(ELECTRODES - 1)])
-    return every_reading(drive.T, measure.T)
 
 
 def every_reading(currents: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:

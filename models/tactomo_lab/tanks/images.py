@@ -1,8 +1,8 @@
 """Linear images of a tank under five priors, and the network that makes objects of them.
 
 The images are posterior means of a smooth change of conductivity, from hardly any freedom to more
-than the noise bears. What they smear the network has learned to undo, from simulated tanks alone:
-`tactomo models train-tanks`. Its images are in each pixel the probabilities of nothing, of an
+than the noise bears. What they smear the network has learned to undo, from simulated tanks alone
+(docs/measured.md). Its images are in each pixel the probabilities of nothing, of an
 object that conducts worse, and of one that conducts better.
 
 Source: Denker, Kereta, Singh, Freudenberg, Kluth, Maass & Arridge, "Data-driven approaches for

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import BrokenExecutor
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
@@ -54,7 +54,6 @@ SHARD = 200  # scenes in a file
 SPACING_SHARE = 5 / 6  # of the map's nodes' distance: 2.5 mm on the paper's sensor
 REFINEMENTS = 2
 PARTS = 3  # that each side of a triangle is divided into, where its conductivity is averaged
-SCENES = "scenes"  # begins the names of the files that hold them
 PRESET = "robust"  # what scenes are drawn by; versions before had a second one
 FORMAT = 2  # raise it when what is drawn or simulated changes
 MANIFEST = "manifest.json"
@@ -213,9 +212,9 @@ def simulate_shard(
     return {key: np.stack([one[key] for one in made]) for key in made[0]}
 
 
-def shard_path(folder: Path, first: int, what: str = SCENES) -> Path:
+def shard_path(folder: Path, first: int) -> Path:
     """File of the shard that begins with a scene's number."""
-    return folder / f"{what}-{first:07d}.npz"
+    return folder / f"scenes-{first:07d}.npz"
 
 
 def simulate(
@@ -236,36 +235,13 @@ def simulate(
         DataError: the sensor has no magnitude channel, or no room for the contacts.
         ModuleNotFoundError: joblib is not installed; it comes with tactomo-lab[train].
     """
-    import joblib  # noqa: F401 - before anything is written
+    from joblib import Parallel, delayed  # before anything is written
 
     SceneSimulator(description)  # refuses a sensor it cannot serve before anything is written
     write_manifest(folder, _manifest(description, seed, scenes))
     make = partial(simulate_shard, description, seed)
-    yield from make_shards(folder, SCENES, shards_of(scenes), make, jobs=jobs)
-
-
-def make_shards(
-    folder: Path,
-    what: str,
-    shards: Iterable[tuple[int, int]],
-    make: Callable[[int, int], dict[str, Any]],
-    *,
-    jobs: int = -1,
-) -> Iterator[int]:
-    """Make what is missing of some shards, on several cores (`jobs`; -1: all).
-
-    Each shard is the number of its first scene, and how many it has; `what` begins its file's name.
-
-    Yields:
-        How many scenes more are there: those of earlier runs first.
-
-    Raises:
-        ModelError: a file cannot be written, or a process fails.
-    """
-    from joblib import Parallel, delayed
-
-    sizes = dict(shards)
-    missing = [n for n in sizes if not is_whole(shard_path(folder, n, what), sizes[n])]
+    sizes = dict(shards_of(scenes))
+    missing = [n for n in sizes if not is_whole(shard_path(folder, n), sizes[n])]
     yield sum(sizes.values()) - sum(sizes[first] for first in missing)
 
     def numbered(first: int, size: int) -> tuple[int, dict[str, Any]]:
@@ -275,7 +251,7 @@ def make_shards(
     try:
         with closing(Parallel(n_jobs=jobs, return_as="generator_unordered")(work)) as made:
             for first, arrays in made:
-                with writing(shard_path(folder, first, what)) as path:
+                with writing(shard_path(folder, first)) as path:
                     write_arrays(path, arrays)
                 yield sizes[first]
     except BrokenExecutor as error:
@@ -362,17 +338,8 @@ def read_scenes(folder: Path) -> dict[str, Any]:
     Raises:
         ModelError: the folder holds none, is not complete, or a file is damaged.
     """
-    return read_shards(folder, SCENES)
-
-
-def read_shards(folder: Path, what: str) -> dict[str, Any]:
-    """Read what a folder holds of all its scenes: `SCENES`, or what was made of them.
-
-    Raises:
-        ModelError: it holds none, is not complete, or a file is damaged.
-    """
     shards = [
-        read_shard(shard_path(folder, first, what), size)
+        read_shard(shard_path(folder, first), size)
         for first, size in shards_of(read_manifest(folder).scenes)
     ]
     return {key: np.concatenate([shard[key] for shard in shards]) for key in shards[0]}

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from challenge_tanks import challenge_pattern
 from scipy.signal import fftconvolve
-from tactomo_lab.tanks.challenge import challenge_pattern, kept_readings, score
+from tactomo_lab.tanks.challenge import kept_readings, score
 from tactomo_models.arrays import FloatArray
 
 

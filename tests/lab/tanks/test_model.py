@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tactomo_lab.tanks.challenge import challenge_pattern, kept_readings
+from challenge_tanks import challenge_pattern
+from tactomo_lab.tanks.challenge import kept_readings
 from tactomo_lab.tanks.model import Readings, TankModel
 from tactomo_models import load_description
 from taylor import taylor_orders

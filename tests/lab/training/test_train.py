@@ -176,7 +176,7 @@ class TestExported:
     ) -> None:
         export_trained(ours, begun(ours), tmp_path / "ours.onnx")
         running = FusionNetwork(Network(tmp_path / "ours.onnx", square, "network"))
-        batches: SceneBatches = ours.objective.batches  # type: ignore[attr-defined]
+        batches: SceneBatches = ours.objective.batches
         for basis, trained in zip(running.bases.values(), batches.bases, strict=True):
             np.testing.assert_allclose(basis, trained, rtol=1e-5, atol=1e-9)
 
@@ -191,7 +191,7 @@ class TestExported:
 
 def test_permuted_electrodes_are_a_turned_scene(ours: Prepared, square: SensorDescription) -> None:
     """Filtered data turn within the space of signals: a wrong permutation would leave it."""
-    batches: SceneBatches = ours.objective.batches  # type: ignore[attr-defined]
+    batches: SceneBatches = ours.objective.batches
     scenes = torch.arange(20)
 
     def drawn(turn: int) -> Batch:
@@ -210,7 +210,7 @@ def test_permuted_electrodes_are_a_turned_scene(ours: Prepared, square: SensorDe
 
 def test_more_noise_tells_less(ours: Prepared) -> None:
     """The filters shrink what they cannot know, and say so."""
-    batches: SceneBatches = ours.objective.batches  # type: ignore[attr-defined]
+    batches: SceneBatches = ours.objective.batches
     known = [
         batches.draw(torch.arange(20), torch.Generator().manual_seed(0), snr_db=snr_db).inputs
         for snr_db in (60.0, 30.0, 0.0)
