@@ -1,13 +1,11 @@
 """The chart of `tactomo bench`: every method's speed against its accuracy, on simulated scenes.
 
 Presses of mixed kinds on skins made by hand: still scenes at three signal-to-noise ratios and
-moving ones, all with reporting seeds. The points go into a table of comma-separated values beside
-the picture (`bench_chart_picture`).
+moving ones, all with reporting seeds.
 """
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -17,8 +15,7 @@ from rich.progress import Progress
 from tactomo.cli.bench.machine_speed import warned_if_busy
 from tactomo.cli.console import Console
 from tactomo.cli.output import say, table
-from tactomo.cli.plot.plot import prepare_file, prepare_picture, save_figure
-from tactomo.errors import TactomoError
+from tactomo.cli.plot.plot import prepare_picture, save_figure
 from tactomo_models import available_methods, load_description
 
 from tactomo_lab.commands.report import shown, usable
@@ -47,23 +44,20 @@ MEASURES: Final = (
 def chart(
     name: str, picture: Path, count: int, machine: str, methods: Sequence[str] = ()
 ) -> tuple[list[dict[str, Any]], Table]:
-    """Measure methods, and write the picture and a table (.csv) beside it.
+    """Measure methods, and write the picture.
 
     Returns:
         A row for each point of the chart, and a table of the Pareto fronts to print.
 
     Raises:
-        TactomoError: a file cannot be written, or matplotlib is missing.
+        TactomoError: the picture cannot be written, or matplotlib is missing.
         ModelError: there are no scenes for such a sensor, or a method of the user's own failed.
     """
     from tactomo_lab.commands.chart_picture import draw_chart
 
     prepare_picture(picture)
-    prepare_file(table_path(picture))
     points, warnings = measure_chart(name, count, methods)
     machine = "; ".join((machine, *warnings))
-    rows = rows_of(points)
-    write_table(rows, machine, table_path(picture))
     moving_scenes = sequences(count)
     title = (
         f"Simulated, not measured on hardware: sensor {name}, reporting seeds; presses of mixed "
@@ -72,13 +66,8 @@ def chart(
         "sizes of markers: budget of modelled work; pale: another point is both faster and better"
     )
     save_figure(draw_chart(points, title), picture)
-    say(f"wrote {picture} and {table_path(picture)}", err=True)
-    return rows, table_of(points)
-
-
-def table_path(picture: Path) -> Path:
-    """Return where the points are written: beside the picture."""
-    return picture.with_suffix(".csv")
+    say(f"wrote {picture}", err=True)
+    return rows_of(points), table_of(points)
 
 
 def sequences(count: int) -> int:
@@ -126,7 +115,7 @@ def measure_chart(
 
 
 def rows_of(points: Sequence[trade_off.Point]) -> list[dict[str, Any]]:
-    """Return the points as flat rows, for JSON and tables; in each panel the fastest first."""
+    """Return the points as flat rows, for JSON; in each panel the fastest first."""
     rows = []
     for panel in trade_off.panels(points):
         front = trade_off.pareto_front(panel)
@@ -145,26 +134,6 @@ def rows_of(points: Sequence[trade_off.Point]) -> list[dict[str, Any]]:
                 }
             )
     return rows
-
-
-def write_table(rows: Sequence[dict[str, Any]], machine: str, path: Path) -> None:
-    """Write the chart's rows as comma-separated values, each with the machine it was measured on.
-
-    Raises TactomoError where the file cannot be written.
-    """
-    try:
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, [*rows[0], "simulated", "seeds", "threads", "machine"])
-            writer.writeheader()
-            for row in rows:
-                shown = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()}
-                how = {"simulated": True, "seeds": SEEDS, "threads": 1, "machine": machine}
-                writer.writerow({**shown, **how})
-    except OSError as error:
-        raise TactomoError(
-            f"cannot write {path}: {error.strerror}",
-            "name a picture in a folder that you may write",
-        ) from error
 
 
 def table_of(points: Sequence[trade_off.Point]) -> Table:

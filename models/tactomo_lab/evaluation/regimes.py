@@ -518,11 +518,6 @@ def _jump(draw: Draw) -> Plan:
     return draw.plan(*[(here, *others)] * SETTLED_FRAMES, (there, *others))
 
 
-@regime("wrong-lambda", "Linear methods' regularisation 100 times too weak or too strong.")
-def _wrong_regularisation(draw: Draw) -> Plan:
-    return replace(draw.plan(draw.scene()), regularisation=draw.in_turn(0.01, 100))
-
-
 @regime(
     "lost-scans",
     "A sliding contact, its last 1 to 3 structure scans lost.",

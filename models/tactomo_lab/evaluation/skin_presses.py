@@ -22,7 +22,7 @@ from tactomo_models.calibration.press_regression import PressRegression
 from tactomo_models.errors import DataError
 from tactomo_models.physics.artifact import Artifact, load_or_build_artifact
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.physics.tikhonov import EVEN, noser_scale, tikhonov_matrix
+from tactomo_models.physics.tikhonov import noser_scale, tikhonov_matrix
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.pattern import scan_positions
 
@@ -30,8 +30,6 @@ from tactomo_lab.evaluation.measured_sets import read_set
 
 METHODS = (
     "mean position (no measurement)",
-    "Tikhonov image",
-    "NOSER image, all voltages",
     "NOSER image",
     "taught by the other presses (no physics)",
 )
@@ -123,15 +121,11 @@ def localise(presses: Presses, description: SensorDescription) -> Iterator[Local
         learnt = PressRegression(presses.changes[train], positions[train] * 1e3)
         return learnt.locate(presses.changes[test]).xy_mm * 1e-3
 
-    def image(noser: bool, halves: bool) -> Estimator:
-        def estimate(train: IntArray, test: IntArray) -> FloatArray:
-            candidates = [imager.affine(noser, halves, weight) for weight in WEIGHTS]
-            return _best(candidates, positions, train)(train, test)
+    def image(train: IntArray, test: IntArray) -> FloatArray:
+        candidates = [imager.affine(weight) for weight in WEIGHTS]
+        return _best(candidates, positions, train)(train, test)
 
-        return estimate
-
-    estimators = (mean, image(False, True), image(True, False), image(True, True), taught)
-    for name, method in zip(METHODS, estimators, strict=True):
+    for name, method in zip(METHODS, (mean, image, taught), strict=True):
         yield Localisation(name, _cross_validated(method, positions))
 
 
@@ -176,16 +170,16 @@ class _Imager:
         self._positive = empty > 0
         grid = np.meshgrid(description.map_x_m, description.map_y_m)
         self._map_m = np.stack([axis.ravel() for axis in grid], axis=1)
-        self._centroids: dict[tuple[bool, bytes, float], FloatArray] = {}
+        self._centroids: dict[tuple[bytes, float], FloatArray] = {}
 
-    def affine(self, noser: bool, halves: bool, weight: float) -> Estimator:
+    def affine(self, weight: float) -> Estimator:
         """Positions by an affine map of the images' centroids, of a press that conducts better."""
 
         def estimate(train: IntArray, test: IntArray) -> FloatArray:
-            use = self._responding(train) if halves else np.ones(len(self._positive), bool)
+            use = self._responding(train)
             # Which way a press changes the conductivity is learnt, too.
             best = min(
-                (self._of(sign, noser, use, weight) for sign in (1.0, -1.0)),
+                (self._of(sign, use, weight) for sign in (1.0, -1.0)),
                 key=lambda c: _affine(c[train], self._presses.positions_m[train])[1],
             )
             map_, _ = _affine(best[train], self._presses.positions_m[train])
@@ -199,11 +193,11 @@ class _Imager:
         more = np.median(size[self._positive]) > np.median(size[~self._positive])
         return self._positive if more else ~self._positive
 
-    def _of(self, sign: float, noser: bool, use: BoolArray, weight: float) -> FloatArray:
-        key = (noser, use.tobytes(), sign * weight)
+    def _of(self, sign: float, use: BoolArray, weight: float) -> FloatArray:
+        key = (use.tobytes(), sign * weight)
         if key not in self._centroids:
             J, even = self._jacobian[use], np.ones(int(use.sum()))
-            spread = noser_scale(J, even) if noser else EVEN
+            spread = noser_scale(J, even)
             power = float(np.mean(((J * spread) ** 2).sum(axis=1)))
             matrix = self._bare.map_weights @ tikhonov_matrix(J, even, weight * power, spread)
             images = np.maximum(sign * (self._presses.changes[:, use] @ matrix.T), 0.0)

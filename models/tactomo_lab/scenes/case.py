@@ -85,7 +85,6 @@ class Plan:
     stretch: float = 0.0  # relative elongation along x, electrodes and all
     behind: int = 0  # by how many scans the structure channel is late in the last frame
     lost: int = 0  # how many structure scans are missing at the end
-    regularisation: float = 1.0  # factor on what the linear methods' rule chooses
 
 
 def as_described(description: SensorDescription, *frames: Sequence[Press]) -> Plan:
@@ -308,18 +307,11 @@ def measure(
         seed_set,
         number,
         plan,
-        _regularised(simulated.told, plan.regularisation),
+        simulated.told,
         simulated.true,
         Reference.from_scans(*map(rest.get, Channel)),
         frames,
     )
-
-
-def _regularised(told: SensorDescription, factor: float) -> SensorDescription:
-    """The sensor with so many times its factor on what the linear methods choose."""
-    weighted = {"regularisation": factor * told.instrument.regularisation}
-    instrument = told.instrument.model_copy(update=weighted)
-    return told.model_copy(update={"instrument": instrument})
 
 
 def with_noise(simulated: Simulated, snr_db: float, snr_of: SnrOf) -> Simulated:

@@ -252,13 +252,11 @@ def score_of(case: Case) -> Judged:
 def test_regularisation_is_so_many_times_what_the_rule_chooses(
     small: SensorDescription, method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    case = case_of(small, "wrong-lambda")
-    factor = case.description.instrument.regularisation
-    assert factor == 0.01
-    wrong = last_of(method, case).made.map
-    told = case.description.model_copy(update={"instrument": small.instrument})
-    case = replace(case, description=told)
+    case, factor = case_of(small, "ordinary"), 0.01
     right = last_of(method, case).made.map
+    instrument = small.instrument.model_copy(update={"regularisation": factor})
+    told = case.description.model_copy(update={"instrument": instrument})
+    wrong = last_of(method, replace(case, description=told)).made.map
     monkeypatch.setattr(
         "tactomo_models.methods.linear.prior_weight",
         lambda *given: factor * linear.prior_weight(*given),

@@ -99,8 +99,8 @@ def bench(
         Path | None,
         typer.Option(
             rich_help_panel=CHART,
-            help="Instead, draw every method's accuracy over its time: .png, .svg or "
-            ".pdf, and a .csv beside it. Needs matplotlib.",
+            help="Instead, draw every method's accuracy over its time: .png, .svg or .pdf. "
+            "Needs matplotlib.",
         ),
     ] = None,
     count: Annotated[
