@@ -1,22 +1,7 @@
 """What is said of a sensor, and on which topics: the bridge says it live, an export to a file.
 
-=====================  ==========================  =================================================
-topic                  schema                      what
-=====================  ==========================  =================================================
-/tf                    foxglove.FrameTransforms    where the sensor hangs
-/SENSOR/sheet          foxglove.SceneUpdate        outline and electrodes
-/SENSOR/contacts       foxglove.SceneUpdate        a disc for each contact, its height the pressure
-/SENSOR/surface        foxglove.SceneUpdate        the map on the surface of a mounted sheet
-/SENSOR/grid           foxglove.Grid               the map: colours, pressure_kpa, magnitude, ...
-/SENSOR/image          foxglove.RawImage           the map as a picture
-/SENSOR/annotations    foxglove.ImageAnnotations   the contacts on that picture
-/SENSOR/frame          tactomo.Frame (JSON)        the numbers: contacts, misfit, flags, timing
-/SENSOR/health         tactomo.Health (JSON)       live only: what is wrong, age, rates, latency
-/SENSOR/events         foxglove.Log                live only: the daemon's events
-=====================  ==========================  =================================================
-
-What is unknown is left out of the JSON messages. A contact there has a `trace`, which it keeps for
-as long as it is followed (`tactomo_client.touch`).
+docs/see_and_keep.md has the topics. What is unknown is left out of the JSON messages. A contact
+there has a `trace`, which it keeps for as long as it is followed (`tactomo_client.touch`).
 """
 
 from __future__ import annotations

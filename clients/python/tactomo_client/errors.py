@@ -3,17 +3,7 @@
 ClientError
 ├── MessageError    a message does not follow STREAM.md: another program publishes there,
 │                   or its version is another one
-├── ControlError    a command was not carried out; `name` says why, and these have a class:
-│   ├── NoAnswer          nothing answers: the daemon is not running, the address is another's
-│   ├── BadArgument       an argument is missing, of the wrong type or out of range
-│   ├── TareRefused       somebody presses the skin during a tare
-│   ├── NoData            no scans came during a tare: the cable is out
-│   ├── AlreadyRecording  a recording runs already
-│   ├── NotRecording      none runs that could be stopped
-│   ├── CannotWrite       the recording's file exists, may not be written, or the disk is full
-│   ├── NoNetwork         the sensor has no network for that method
-│   ├── NoReplay          nothing is replayed
-│   └── CalibrationRefused  the pressure calibration is damaged, another sensor's or device's
+├── ControlError    a command was not carried out; `name` says why, and some have a class
 ├── StreamTimeout   no frame came within `timeout_s`: the cable is out, the name is misspelt
 ├── KeysError       keys cannot be used (the file is missing, others may read it), or the server
 │                   does not let them in: the client is not on its list, it is another server

@@ -1,22 +1,8 @@
 """A frame as arrays of fixed shapes, for learning: what a dataset holds and a policy is given.
 
-=================  ==================  =============================================================
-array              shape, dtype        meaning
-=================  ==================  =============================================================
-pressure_kpa       (ny, nx) float32    0 where nothing touches, and where `known` is 0
-known              (ny, nx) uint8      1 where the pressure is known, and the frame would show every
-                                       touch; 0 elsewhere
-magnitude          (ny, nx) float32    |Δσ|/σ₀
-structure          (ny, nx) float32    how surely the node is pressed, 0 to 1
-contacts           (n, k) float64      a row for each contact, `CONTACT_COLUMNS`; a contact keeps
-                                       its row for as long as it lives
-contacts_known     (n, k) uint8        1 where the number beside it is one; 0 in empty rows, too
-is_known           (1,) uint8          whether no contacts means nothing pressed
-has_frame          (1,) uint8          0 where there is no frame, and all else is 0
-=================  ==================  =============================================================
-
-What is not known is 0 beside a mask that says so, not NaN: one NaN makes NaN of all statistics that
-learning scales its inputs by. No value of a known number is changed.
+docs/lerobot.md has the arrays. What is not known is 0 beside a mask that says so, not NaN: one NaN
+makes NaN of all statistics that learning scales its inputs by. No value of a known number is
+changed.
 """
 
 from __future__ import annotations

@@ -1,24 +1,7 @@
 """A frame as ROS 2 messages of standard types, for bags and for live publishers alike.
 
-=========================  ====================================  ===================================
-topic                      type                                  message
-=========================  ====================================  ===================================
-/SENSOR/map                sensor_msgs/PointCloud2               the sheet's nodes, ny rows of nx
-/SENSOR/contacts           sensor_msgs/PointCloud2               a point for each contact; none:
-                                                                 nothing pressed, or not `is_known`
-/SENSOR/contact_wrenches   geometry_msgs/WrenchStamped           one for each contact, in its frame
-/SENSOR/contact_poses      geometry_msgs/                        likewise, in the sensor's frame
-                           PoseWithCovarianceStamped
-/tf                        tf2_msgs/TFMessage                    SENSOR to SENSOR/contact_ID
-/diagnostics               diagnostic_msgs/DiagnosticArray       trust, timing, identity; live also
-                                                                 what the daemon finds wrong
-=========================  ====================================  ===================================
-
-Stamps are when the scan was acquired. The frame SENSOR has its origin at the sheet's centre, x to
-the right, y up, z out of the pressed side (REP 103: metres, newtons; kilopascals are named so).
-Where the sensor description has a [mount], map, contacts and poses are in the link's frame instead,
-on the sheet's surface there, and /tf goes from the link to SENSOR/contact_ID, z along the normal.
-What is unknown is NaN, or absent; docs/ros2.md says more.
+docs/ros2.md has the topics and their frames. Stamps are when the scan was acquired. What is unknown
+is NaN, or absent.
 """
 
 from __future__ import annotations

@@ -1,37 +1,9 @@
 """Recordings: what the ports said, with times, in one MCAP file; its layout, and reading it.
 
-Messages are in the order in which they were written, and that order is what counts:
-
-=============  ==========  =======================================================================
-topic          encoding    message
-=============  ==========  =======================================================================
-port/N         raw         bytes of port N exactly as read, in the protocol of its device
-port/N/hello   raw         what a replay must be told before those: the hello in force when the
-                           recording began, and the packet that had begun to come; for a foreign
-                           protocol also where in its scans the port was (`protocols.interface`),
-                           and again every second
-reference      msgpack     the reference that holds from here on: its number in this recording,
-                           volts and noise of each channel, and how far they have drifted since;
-                           repeated every minute
-frame          msgpack     a dual scan that the daemon reconstructed: channel, counter and device
-                           time of each of its scans, the tier and the budget (ms of modelled
-                           work, not of time) that it was reconstructed with, the numbers of the
-                           reference and of the calibration in force, whether it started cold, and
-                           its timing
-calibration    msgpack     the pressure calibration that holds from here on, where another one than
-                           the metadata's was put in force meanwhile: its number in this recording
-                           and its text; repeated every minute
-map, contacts  stream      messages exactly as published, if asked for; scan likewise, as long as
-                           anybody subscribes to it
-=============  ==========  =======================================================================
-
-A recording that is cut into several files says all of this in each: any of them can be replayed
-alone. At a cut, the ports' bytes go into both files until the pipeline has come over to the new
-one, so every dual scan lies whole in the file that has its mark.
-
-`log_time` is a steady clock: the wall clock when the recording began plus the monotonic time
-since. `publish_time` is the wall clock itself. The metadata record ``tactomo`` says which sensor
-it was, and which protocol its ports spoke.
+docs/files.md has the topics and their fields. Messages are in the order in which they were written,
+and that order is what counts. A recording that is cut into several files says all in each: any of
+them can be replayed alone. At a cut, the ports' bytes go into both files until the pipeline has
+come over to the new one, so every dual scan lies whole in the file that has its mark.
 
 The file of a daemon that was killed ends somewhere in its last chunk. Everything here reads with
 MCAP's streaming reader, so such a file opens like any other, up to its last complete chunk. What

@@ -11,12 +11,6 @@ every scan.
     twin.start()
     print(twin.ports, twin.control)
     twin.stop()
-
-The parts: `scene` (what presses, by script), `surface` (what presses now), `firmware` (the
-microcontroller), `converter` (noise, drift, counts), `line` (the serial line), `control` (its
-control socket) and `device`, which puts them together. In the skin's place there may be measured
-frames (`playing`), and in the firmware's another instrument (`foreign`, and an emulator of each
-protocol).
 """
 
 from tactomo.twin.device import SkinModel, Twin, TwinConfig, make_skin

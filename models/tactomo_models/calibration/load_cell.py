@@ -1,22 +1,7 @@
 """A load cell's log (CSV) and what a sensor showed at those times, joined to calibration readings.
 
-Columns, in any order, separated by comma, semicolon or tab; lines that begin with # are skipped:
-
-==================  ===================================================================
-`pressure_kpa`      what was pressed with; or
-`force_n`           ... by the force, on an indenter of
-`area_mm2`          ... this area, or
-`diameter_mm`       ... this diameter, if it is round; or one for all, by an option
-`magnitude`         what the sensor showed, |relative conductivity change|; or
-`time_s`            when, in seconds from the beginning of a recording; or
-`realtime_s`        ... in seconds since 1970 (UTC)
-`magnitude_sigma`   standard uncertainty of `magnitude`; may be left out
-`contact_mm2`       area of the contact that it showed; may be left out
-`direction`         of the load: up or down; else it follows from the order of the lines
-==================  ===================================================================
-
-A log of many lines a second is cut into pieces in which the load was still. So is one line for
-each press, by hand.
+docs/files.md has the columns. A log of many lines a second is cut into pieces in which the load was
+still. So is one line for each press, by hand.
 """
 
 from __future__ import annotations
