@@ -1,7 +1,8 @@
 """A recording's file: what is in it by name, and reading it record by record, damaged or not.
 
 The layout is that of the daemon, which writes and replays recordings through the names here;
-docs/files.md says what each topic holds. For frames, see `tactomo_client.recording`. Beyond damage, `intact_chunks` finds what its checksum confirms.
+docs/files.md says what each topic holds. For frames, see `tactomo_client.recording`. Beyond
+damage, `intact_chunks` finds what its checksum confirms.
 """
 
 from __future__ import annotations
