@@ -139,7 +139,7 @@ deb: $(READY)    ## the Debian package, for this distribution and processor, in 
 lock:            ## refresh the lock files (needs uv on the PATH)
 	uv pip compile $(LOCKED) --extra dev --group build -o requirements.lock
 	uv pip compile $(LOCKED) --group build -c requirements.lock -o requirements-run.lock
-	uv pip compile pyproject.toml --extra foxglove --extra matlab --extra metrics --extra plot --extra ros2 --extra zenoh --group build \
+	uv pip compile pyproject.toml --extra drawings --extra foxglove --extra matlab --extra metrics --extra plot --extra ros2 --extra zenoh --group build \
 	  $(ON_ARM) -c requirements.lock -o requirements-aarch64.lock
 	uv pip compile --group docs --universal --python-version 3.11 --generate-hashes \
 	  -c requirements.lock -o requirements-docs.lock

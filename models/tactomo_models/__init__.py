@@ -12,6 +12,7 @@ offline run this same code. Its folders, in the order in which each builds on th
 
 ===============  =================================================================================
 sensor           description of a skin and its file: pattern, sheet, response
+imported         descriptions from drawings and from models of EIDORS and pyEIT
 physics          mesh, forward model, artifacts, sensitivity, linear reconstruction matrices
 scans            from voltages to changes: polarity, plausibility, reference
 scene            shapes, areas, contacts and pressure of a scene

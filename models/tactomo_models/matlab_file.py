@@ -1,4 +1,4 @@
-"""Numbers of a .mat file, pickled to standard output: those in structs as `struct.field`.
+"""Numbers of a .mat file, pickled to standard output: `struct.field`, `structs(2).field`.
 
 A program of its own, which `array_files` runs, with the memory and the time that it may take: a few
 kilobytes may claim gigabytes, anywhere in a struct, and libhdf5 may end the process that reads
@@ -29,12 +29,18 @@ def of_group(name: str, item: Any, largest: int) -> Iterator[tuple[str, Any]]:
     import h5py
 
     if isinstance(item, h5py.Group):
+        if "MATLAB_sparse" in item.attrs:
+            yield name, _dense(item, largest)
+            return
         for field, each in item.items():
-            if field[0] != "#" and "MATLAB_sparse" not in item.attrs:
+            if field[0] != "#":
                 yield from of_group(f"{name}.{field}" if name else field, each, largest)
     elif h5py.check_ref_dtype(item.dtype):
-        if item.size == 1:
-            yield from of_group(name, item.file[item[()].flat[0]], largest)
+        links, (structs, dot, field) = item[()].ravel(), name.rpartition(".")
+        is_structs = dot and item.attrs.get("MATLAB_class") is None  # a field of each
+        for number, link in enumerate(links if is_structs or len(links) == 1 else (), 1):
+            place = f"{structs}({number}).{field}" if len(links) > 1 else name
+            yield from of_group(place, item.file[link], largest)
     elif item.attrs.get("MATLAB_class") != b"char" and "MATLAB_empty" not in item.attrs:
         if item.nbytes > largest:
             raise ValueError(f"{name} is larger than its file can hold")
@@ -45,15 +51,30 @@ def of_group(name: str, item: Any, largest: int) -> Iterator[tuple[str, Any]]:
             yield name, array
 
 
+def _dense(item: Any, largest: int) -> np.ndarray[Any, Any]:
+    """Return a sparse matrix of an HDF5 file."""
+    from scipy.sparse import csc_array
+
+    rows, columns = int(item.attrs["MATLAB_sparse"]), len(item["jc"]) - 1
+    if 8 * rows * columns > largest:
+        raise ValueError("a sparse matrix is larger than its file can hold")
+    if "data" not in item:
+        return np.zeros((rows, columns))
+    parts = (item["data"][()], item["ir"][()], item["jc"][()])
+    return np.asarray(csc_array(parts, shape=(rows, columns)).toarray())
+
+
 def of_matlab(prefix: str, held: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     """Yield arrays of numbers of what scipy reads, from a struct or a cell of one array, too."""
     for name, value in held.items():
         array = value.toarray() if hasattr(value, "toarray") else np.asarray(value)
         if name.startswith("__"):
             continue
-        if array.dtype.names and array.size == 1:  # a struct
-            fields = {field: array[field].flat[0] for field in array.dtype.names}
-            yield from of_matlab(f"{prefix}{name}.", fields)
+        if array.dtype.names:  # a struct, or an array of them
+            for number, struct in enumerate(array.ravel(), 1):
+                fields = {field: struct[field] for field in array.dtype.names}
+                place = f"{name}({number})" if array.size > 1 else name
+                yield from of_matlab(f"{prefix}{place}.", fields)
         elif array.dtype == object and array.size == 1:  # a cell
             yield from of_matlab(prefix, {name: array.flat[0]})
         elif array.dtype.kind in "biufc" and array.size:

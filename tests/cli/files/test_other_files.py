@@ -15,6 +15,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
+from scipy.sparse import csc_array
 from tactomo.errors import TactomoError
 from tactomo.recordings.imported_scans import read_scans
 from tactomo_models import DataError, DescriptionError, Press, SkinSimulator, load_description
@@ -91,6 +92,11 @@ def save_hdf5(path: Path, arrays: dict[str, Any]) -> None:
         elif isinstance(value, str):
             codes = np.array([[ord(letter)] for letter in value], np.uint16)
             made, kind = group.create_dataset(name, data=codes), "char"
+        elif hasattr(value, "tocsc"):
+            made, kind = group.create_group(name), "double"
+            made.attrs["MATLAB_sparse"] = np.uint64(value.shape[0])
+            for field, part in (("data", value.data), ("ir", value.indices), ("jc", value.indptr)):
+                made.create_dataset(field, data=part)
         else:
             turned = np.ascontiguousarray(value.T)
             if turned.dtype.kind == "c":
@@ -120,6 +126,13 @@ def test_matlab_arrays_of_version_7_3(tactomo: Run, tmp_path: Path) -> None:
     read = read_arrays(tmp_path / "b.mat")
     assert list(read) == ["vi.meas"]
     np.testing.assert_array_equal(read["vi.meas"], there * 1j)
+    sparse = csc_array(np.where(rest > 0, rest, 0))
+    save_hdf5(tmp_path / "d.mat", {"s": {"f": [sparse, there]}})
+    with h5py.File(tmp_path / "d.mat", "r+") as file:  # a field of an array of structs
+        del file["s/f"].attrs["MATLAB_class"]
+    read = read_arrays(tmp_path / "d.mat")
+    np.testing.assert_array_equal(read["s(1).f"], sparse.toarray())
+    np.testing.assert_array_equal(read["s(2).f"], there)
     cells = np.empty((2, 1), object)
     cells[:, 0] = rest, there
     savemat(tmp_path / "c.mat", {"vh": cells[:1], "several": cells})

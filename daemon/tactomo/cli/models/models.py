@@ -84,6 +84,93 @@ def copy(
     say(f"wrote {path}; give it to --description")
 
 
+@app.command(
+    "import",
+    epilog=examples(
+        "tactomo models import sole.dxf sole.toml",
+        "tactomo models import palm.svg palm.toml --count 24 --electrode-mm 6",
+        "tactomo models import fmdl.mat tank.toml --unit-mm 140 --electrode-mm 10",
+    ),
+)
+def import_model(
+    source: Annotated[
+        Path, typer.Argument(metavar="IN", help="A .dxf, .svg, EIDORS .mat or pyEIT .npz file.")
+    ],
+    path: Annotated[Path, typer.Argument(metavar="OUT.toml", help="The description to write.")],
+    unit_mm: Annotated[
+        float | None,
+        typer.Option(min=1e-3, max=1e5, help="Millimetres of a unit of the file. [the file's own]"),
+    ] = None,
+    electrode_mm: Annotated[
+        float | None,
+        typer.Option(min=0.01, max=1e4, help="Length of an electrode. [the file's]"),
+    ] = None,
+    electrodes: Annotated[
+        str, typer.Option(metavar="LAYER", help="The drawing's layer of electrodes.")
+    ] = "electrodes",
+    outline: Annotated[
+        str | None,
+        typer.Option(metavar="LAYER", help="The drawing's layer of outline and holes. [all other]"),
+    ] = None,
+    count: Annotated[
+        int | None,
+        typer.Option(min=6, max=64, help="Place so many electrodes evenly along the outline."),
+    ] = None,
+) -> None:
+    """Write the description of a sensor that a drawing or an EIT model shows.
+
+    In drawings, the largest closed line is the outline; the others are holes. Electrodes are points
+    or shapes on a layer (SVG: in a group), numbered in the order of the file. DXF needs ezdxf, SVG
+    needs svgelements: `pip install 'tactomo[drawings]'`. An EIDORS model is a .mat of fwd_model.
+    Of pyEIT, save node, element, el_pos, ex_mat and meas_mat by `numpy.savez`.
+    """
+    import re
+
+    from tactomo_models.imported.drawing import read_drawing
+    from tactomo_models.imported.mesh import read_model
+    from tactomo_models.imported.model import describe, evenly_placed
+
+    from tactomo.errors import TactomoError, needs, os_errors_as
+
+    read_step = "give a .dxf, .svg, .mat or .npz file"
+    is_drawing = source.suffix.lower() in (".dxf", ".svg")
+    with (
+        os_errors_as(TactomoError, f"cannot read {source}", read_step),
+        needs(f"{source.suffix[1:].upper()}", "pip install 'tactomo[drawings]'"),
+    ):
+        model = (
+            read_drawing(source, electrodes, outline, unit_mm)
+            if is_drawing
+            else read_model(source, unit_mm)
+        )
+    if count is not None:
+        model = evenly_placed(model, count)
+    if not len(model.centres):
+        raise TactomoError(
+            f"{source} has no electrodes" + (f" on a layer {electrodes!r}" if is_drawing else ""),
+            "name their layer by --electrodes, or place them evenly by --count",
+        )
+    name = re.sub(r"\W+", "_", path.stem.lower(), flags=re.ASCII).strip("_0123456789") or "sensor"
+    text, sensor = describe(model, source, name, electrode_mm)
+    with (
+        os_errors_as(TactomoError, f"cannot write {path}", "give the path of a new file"),
+        path.open("x", encoding="utf-8") as file,
+    ):
+        file.write(text)
+    x_mm, y_mm = 1e3 * sensor.electrode_centres_m[0]
+    say(
+        f"wrote {path}: {sensor.sheet.shape} of {1e3 * sensor.width_m:.4g} x "
+        f"{1e3 * sensor.height_m:.4g} mm, {len(sensor.sheet.holes_m)} hole(s), "
+        f"{sensor.electrode_count} electrodes of {1e3 * sensor.electrodes.length_m:.3g} mm"
+    )
+    if model.pattern is not None and model.pattern.note:
+        say(model.pattern.note)
+    say(
+        f"Electrode 0 is at ({x_mm:.1f}, {y_mm:.1f}) mm: `tactomo models draw {path}` shows all. "
+        "Numbers, contact impedance, map and response are for you to check."
+    )
+
+
 @app.command(name="list")
 def list_sensors() -> None:
     """List the sensor descriptions that come with tactomo."""
