@@ -104,7 +104,7 @@ def reconstruct_file(
     readings: dict[str, FloatArray] | None = None
     if description.companion and read is None:
         total = max(len(channel) for channel in scans.values())
-        readings, at_rest = read_companions(source, description, total)
+        readings, at_rest = companions_of(source, read_arrays(source), description, total)
         reference = replace(reference, companions=tuple(at_rest.items()))
     if taught is not None and (why := taught.changed(reference)):
         raise CalibrationError(f"what was taught does not fit this skin: {why}; teach it anew")
@@ -179,15 +179,14 @@ def read_scans(
     return scans, reference_at_rest(source, scans, references, description)
 
 
-def read_companions(
-    source: Path, description: SensorDescription, frames: int
+def companions_of(
+    source: Path, arrays: Mapping[str, Any], description: SensorDescription, frames: int
 ) -> tuple[dict[str, FloatArray], dict[str, float]]:
-    """Read the readings (T,) of the companions that are there, and their means at rest.
+    """Return the readings (T,) of the companions that a file has, and their means at rest.
 
     Raises:
-        DataError: the file cannot be read, or readings are not as many as frames.
+        DataError: readings are not as many as frames.
     """
-    arrays = read_arrays(source)
     readings, at_rest = {}, {}
     for name in description.companion:
         key = f"companion_{name}"

@@ -36,10 +36,10 @@ from numpy.typing import NDArray
 from tactomo_models import Reference, SensorDescription
 from tactomo_models.archive import read_arrays
 from tactomo_models.arrays import FloatArray
-from tactomo_models.batch import all_nan, checked, scans_of
+from tactomo_models.batch import all_nan, checked, companions_of, scans_of
 from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
 from tactomo_models.sensor.pattern import rim_signs, touching
-from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
+from tactomo_protocol import Channel, CompanionReading, Hello, SampleFormat, Scan, ScanFlag
 
 from tactomo.errors import TactomoError, os_errors_as
 from tactomo.recordings.eit_files import SUFFIX, eit_files, read_eit_files
@@ -69,6 +69,8 @@ class Scans:
         reference: (M,) or (n, M) volts of each channel whose unloaded scans the file holds.
         notes: what a user should know about how the file was read.
         turned_rad: the angle that complex volts were turned by.
+        companions: (T,) readings of companions by name; NaN where there was none.
+        companions_at_rest: readings of companions with nothing on the skin, by name.
     """
 
     volts: Mapping[Channel, FloatArray]
@@ -76,6 +78,8 @@ class Scans:
     reference: Mapping[Channel, FloatArray] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     turned_rad: float | None = None
+    companions: Mapping[str, FloatArray] = field(default_factory=dict)
+    companions_at_rest: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def count(self) -> int:
@@ -103,11 +107,14 @@ class Scans:
         """Return the mean of `frames` as the reference, or else the file's own, or None."""
         if frames is not None:
             chosen = {channel: self._chosen(channel, frames) for channel in Channel}
-            return Reference.from_scans(**chosen)
+            rest = {name: float(np.mean(each[frames])) for name, each in self.companions.items()}
+            known = tuple((name, mean) for name, mean in rest.items() if np.isfinite(mean))
+            return replace(Reference.from_scans(**chosen), companions=known or None)
         if not self.reference:
             return None
         magnitude, structure = map(self.reference.get, (Channel.MAGNITUDE, Channel.STRUCTURE))
-        return Reference.at_rest(magnitude, structure)
+        at_rest = tuple(self.companions_at_rest.items()) or None
+        return replace(Reference.at_rest(magnitude, structure), companions=at_rest)
 
     def _chosen(self, channel: Channel, frames: slice) -> FloatArray | None:
         volts = self.volts.get(channel)
@@ -120,9 +127,16 @@ class Scans:
             )
         return volts[frames]
 
-    def packets(self, times_s: FloatArray) -> Iterator[tuple[float, Scan]]:
-        """Yield every scan with its time in seconds, as the device would have sent it."""
+    def packets(
+        self, times_s: FloatArray, description: SensorDescription
+    ) -> Iterator[tuple[float, Scan | CompanionReading]]:
+        """Yield readings and scans with their times in seconds, as the device would have."""
         for counter, time_s in enumerate(times_s):
+            device_us = round(float(time_s) * 1e6)
+            for index, name in description.companion_indices.items():
+                value = float(self.companions[name][counter]) if name in self.companions else np.nan
+                if np.isfinite(value):
+                    yield float(time_s), CompanionReading(index, ScanFlag(0), device_us, value)
             for channel, volts in self.volts.items():
                 if not np.all(np.isnan(volts[counter])):
                     yield (
@@ -130,7 +144,7 @@ class Scans:
                         Scan(
                             channel=channel,
                             counter=counter,
-                            device_us=round(float(time_s) * 1e6),
+                            device_us=device_us,
                             flags=ScanFlag(0),
                             samples=volts[counter].astype(np.float32),
                         ),
@@ -179,7 +193,8 @@ def read_scans(
     arrays = load_arrays(path)
     path = path if isinstance(path, Path) else path[0]
     if array is None and any(name in arrays for name in Channel):
-        return _turned_round(_batch(path, arrays, description), description)
+        scans = _batch(path, arrays, description)
+        return _turned_round(_with_companions(path, arrays, scans, description), description)
     rest: NDArray[Any] | None = None
     if array is None and is_single_ended(arrays):
         raw, time_s = _differences(path, arrays, description)
@@ -189,7 +204,14 @@ def read_scans(
     volts, notes, turned_rad = _in_phase(path, raw, turn_rad)
     reference = {} if rest is None else {channel: _in_phase(path, rest, turned_rad)[0]}
     scans = Scans({channel: volts}, time_s, reference, notes, turned_rad)
-    return _turned_round(scans, description)
+    return _turned_round(_with_companions(path, arrays, scans, description), description)
+
+
+def _with_companions(
+    path: Path, arrays: dict[str, NDArray[Any]], scans: Scans, description: SensorDescription
+) -> Scans:
+    readings, at_rest = companions_of(path, arrays, description, scans.count)
+    return replace(scans, companions=readings, companions_at_rest=at_rest)
 
 
 def _turned_round(scans: Scans, description: SensorDescription) -> Scans:

@@ -20,7 +20,7 @@ from mcap.writer import Writer
 from tactomo_client.messages import array_to_wire
 from tactomo_client.recording_file import CHANNELS, PROFILE
 from tactomo_models import Reference
-from tactomo_protocol import Hello, Scan, encode
+from tactomo_protocol import CompanionReading, Hello, Scan, encode
 
 from tactomo.errors import RecordingError
 from tactomo.recordings.recording import DRIFT_ARRAYS, REFERENCE_ARRAYS, REPLAY_SCHEME, Origin
@@ -280,7 +280,8 @@ def create(path: Path, origin: Origin) -> RecordingWriter:
 def write_recording(
     path: str | Path,  # the file to write; it must not exist
     hello: Hello,  # what the device would have said it is; repeated every second
-    scans: Iterable[tuple[float, Scan]],  # each with its time in seconds since the first, ascending
+    # each with its time in seconds since the first, ascending
+    packets: Iterable[tuple[float, Scan | CompanionReading]],
     *,
     sensor: str,  # the sensor's name
     description: str,  # the sensor description's name or path
@@ -310,8 +311,8 @@ def write_recording(
     try:
         if reference is not None:
             writer.add(reference_entry(reference, 1, monotonic_ns, realtime_ns))
-        for time_s, scan in scans:
-            data = encode(scan)
+        for time_s, packet in packets:
+            data = encode(packet)
             if time_s - hello_at_s >= HELLO_PERIOD_S:
                 data, hello_at_s = encode(hello) + data, time_s
             after_ns = round(time_s * 1e9)

@@ -14,7 +14,7 @@ from shared_data import measured
 from tactomo.recordings.recording import Recording, open_recording
 from tactomo_models import load_description
 from tactomo_models.arrays import FloatArray
-from tactomo_protocol import Channel, Decoder, Scan
+from tactomo_protocol import Channel, CompanionReading, Decoder, Scan
 
 Run = Callable[..., Any]
 
@@ -118,6 +118,34 @@ def test_the_batch_layout_keeps_channels_reference_and_gaps(tactomo: Run, tmp_pa
     assert reference is not None
     assert (reference.magnitude[0], reference.structure[0]) == (0.5, 0.25)  # type: ignore[index]
     assert recording.summary.origin.sensor == "left_forearm"
+
+
+def test_readings_of_companions_are_kept(tactomo: Run, tmp_path: Path) -> None:
+    assert tactomo("models", "copy", "graded_square", "cell.toml").returncode == 0
+    cells = "[companion.cell]\nindex = 7\ngain_n_per_unit = 2.0\nnoise_n = 0.1\n"
+    with (tmp_path / "cell.toml").open("a") as file:
+        file.write(cells)
+    volts = np.random.default_rng(0).normal(size=(4, 208))
+    readings = np.array([1.0, 2.0, np.nan, 4.0])
+    arrays = {"magnitude": volts, "magnitude_reference": volts[0], "companion_cell": readings}
+    np.savez(tmp_path / "in.npz", **arrays, companion_cell_reference=0.5)
+    options = ("-d", "cell.toml", "--rate", "20")
+    result = tactomo("import", "in.npz", "out.mcap", *options)
+    assert result.returncode == 0, result.stderr
+    recording, decoder = open_recording(tmp_path / "out.mcap"), Decoder()
+    packets = [p for _, data in recording.chunks(0) for p in decoder.feed(data)]
+    kept = [p for p in packets if isinstance(p, CompanionReading)]
+    assert [(p.index, p.device_us, p.value) for p in kept] == [
+        *((7, 0, 1.0), (7, 50_000, 2.0), (7, 150_000, 4.0)),
+    ]
+    reference = recording.first_reference()
+    assert reference is not None
+    assert tuple(reference.companions or ()) == (("cell", 0.5),)
+    result = tactomo("import", "in.npz", "again.mcap", *options, "--reference-frames", "0:2")
+    assert result.returncode == 0, result.stderr
+    reference = open_recording(tmp_path / "again.mcap").first_reference()
+    assert reference is not None
+    assert tuple(reference.companions or ()) == (("cell", 1.5),)
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,8 @@ def import_scans(
     files. Single-ended readings are `volts` (T, injections, electrodes) with `injection`
     (injections, 2) and `t`. Their differences of neighbouring electrodes become the voltages, in
     the description's order; of complex volts, the part in phase with the current counts. Sciospec's
-    program saves one .eit file per frame; the files are read in the order of their dates.
+    program saves one .eit file per frame; the files are read in the order of their dates. Readings
+    of companions (`companion_NAME`) are kept.
     """
     from rich.progress import track
     from tactomo_models import load_description
@@ -65,7 +66,7 @@ def import_scans(
     length = write_recording(
         recording,
         read.hello(measured, float(mean_rate_hz)),
-        track(read.packets(times_s), "importing", total, transient=True),
+        track(read.packets(times_s, measured), "importing", total, transient=True),
         sensor=sensor,
         description=_portable(description),
         description_sha256=measured.sha256,
