@@ -350,11 +350,11 @@ class Events:
     companion_back = INFO  #: The companion reads again within its limits
     #: A device sends readings of a companion whose index the sensor description does not have
     companion_unknown = EventKind("warning", period_s=600.0)
-    #: Scans of one channel repeat bit for bit while their counter rises, although they had noise at
-    #: the tare: the daemon treats them as missing. Of drives or measuring pairs that repeat, the
-    #: daemon leaves out those alone (``invalid_voltage``). A converter that is frozen during the
-    #: first tare cannot be told from a source without noise; `tactomo doctor` then reports "no
-    #: noise at all"
+    #: Scans of one channel repeat one of their last 16, but for less than a tenth of the tare's
+    #: noise, while their counter rises: the daemon treats them as missing. Of drives or measuring
+    #: pairs that repeat bit for bit, the daemon leaves out those alone (``invalid_voltage``). A
+    #: converter that is frozen during the first tare cannot be told from a source without noise;
+    #: `tactomo doctor` then reports "no noise at all". Where the noise really fell so far, tare
     converter_frozen = EventKind("warning", end="converter_back")
     converter_back = INFO  #: The channel's scans change again
     #: A port was closed, unplugged, or cannot be opened. The daemon keeps trying

@@ -1,4 +1,4 @@
-"""A converter that is frozen: its scans repeat bit for bit while their counter goes on.
+"""A converter that is frozen: its scans repeat earlier ones while their counter goes on.
 
 See `tactomo_models.scans.repeats`. A channel that is frozen all through its first tare cannot be
 told from a source without noise.
@@ -38,9 +38,9 @@ class FrozenConverters:
                 what = f"{channel} {', '.join(parts) or 'scans'}"
                 self._on_event(
                     "converter_frozen",
-                    f"{what} repeat bit for bit; maps go on without them",
-                    "switch that channel's board off and on; if it stays so, its converter or "
-                    "firmware is at fault",
+                    f"{what} repeat earlier ones; maps go on without them",
+                    "switch that channel's board off and on; if its scans still repeat, its "
+                    "converter or firmware is at fault; if its noise really fell to a tenth, tare",
                     channel,
                 )
             else:

@@ -22,6 +22,7 @@ import numpy as np
 from tactomo_models import ModelError, Reference
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scans.companion_forces import CompanionReading
+from tactomo_models.scans.frame_noise import noise_limit
 from tactomo_models.scans.tare import Tare
 from tactomo_protocol import Channel
 
@@ -247,15 +248,15 @@ class _Scans:
 
 
 def is_at_rest(volts: Mapping[Channel, Volts], reference: Reference) -> bool:
-    """Whether scans (M,) are as the reference has them, but for noise and what rests at that."""
+    """Whether noise alone explains how scans (M,) differ from the reference."""
     for channel, scan in volts.items():
-        rest = getattr(reference, channel)
-        if rest is None:
+        rest, noise = getattr(reference, channel), getattr(reference, f"{channel}_noise")
+        if rest is None or noise is None:
             return False
-        noise = getattr(reference, f"{channel}_noise")
-        size = _size(rest)
-        allowed = MOVEMENT_LIMIT + (0.0 if noise is None else _rms(2 * noise / size))
-        if not _rms((scan - rest) / size) <= allowed:
+        changes = (scan - rest)[noise > 0] / noise[noise > 0]
+        freedom = max(1, reference.scans - 1) * len(changes)
+        limit = (1 + 1 / reference.scans) * noise_limit(len(changes), freedom)
+        if not np.sum(changes**2) <= limit:
             return False
     return bool(volts)
 
@@ -277,7 +278,3 @@ def _size(volts: Volts) -> Volts:
     """What changes (M,) are relative to: small voltages do not count for more than larger ones."""
     size = np.abs(volts)
     return np.maximum(size, max(size.max() * SMALLEST_SHARE, np.finfo(float).tiny))
-
-
-def _rms(values: Volts) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -1,13 +1,16 @@
-"""What a scan repeats of the last one, bit for bit: that was not measured.
+"""What a scan repeats of earlier ones: that was not measured.
 
-Noise makes every scan another one. Where the scans of a tare had noise, what is the last scan over
-again says what the skin was at another time. That holds of a whole channel, and of all that one
-drive or one measuring pair reads in it: a multiplexer sticks, or one converter of many does.
+Noise makes every scan another one. Where the scans of a tare had noise, a scan that is an earlier
+one over again says what the skin was at another time. That holds of a whole channel, and of all
+that one drive or one measuring pair reads in it: a multiplexer sticks, or one converter of many
+does. A whole channel need not repeat bit for bit, nor its last scan: a last bit flickers, and
+firmware sends its buffers round and round.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections import deque
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from tactomo_protocol import Channel
@@ -16,6 +19,12 @@ from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.scans.frame_noise import FALSE_ALARM
 from tactomo_models.scans.reference import Reference
 from tactomo_models.sensor.pattern import Pairs
+
+LEAST_NOISE: Final = 0.1
+"""Share of the tare's noise that a converter at work has at least: what is left by the mean of a
+hundred scans. A flicker of one count is told where the tare's noise is 8 counts or more."""
+EARLIER: Final = 16
+"""Scans that one is held against: a longer round of buffers is not told."""
 
 
 class Repeated(NamedTuple):
@@ -36,22 +45,29 @@ class Repeats:
         }
         self._names, self._parts = np.array(list(parts)), np.array(list(parts.values()))
         self._sizes = self._parts.sum(axis=1)
-        self._last: dict[Channel, FloatArray] = {}
+        self._earlier: dict[Channel, deque[FloatArray]] = {}
 
     def find(
         self, channel: Channel, scan: FloatArray, reference: Reference | None
     ) -> Repeated | None:
-        """What a scan (M,) repeats of its channel's last one: all of it, or drives and pairs.
+        """What a scan (M,) repeats: all of an earlier one, or drives and pairs of the last one.
 
         Coarse counts repeat by chance: as often as those beside the drives and pairs in question.
         None where nothing can be told: of the first scan, and of those without noise at the tare.
         """
-        last, self._last[channel] = self._last.get(channel), scan
-        if last is None or not _is_noisy(reference, channel, scan):
+        scans = self._earlier.setdefault(channel, deque(maxlen=EARLIER))
+        earlier = np.concatenate([np.empty(0), *scans]).reshape(len(scans), len(scan))
+        scans.append(scan)
+        noise: Any = getattr(reference, f"{channel}_noise", None)
+        if not len(earlier) or not _is_noisy(reference, noise, scan):
             return None
-        same = scan == last
-        if same.all():
-            return Repeated((), same)
+        changes = (scan - earlier) / np.where(noise > 0, noise, np.inf)
+        squares = np.einsum("nm,nm->n", changes, changes)
+        if (squares < 2 * LEAST_NOISE**2 * np.count_nonzero(noise)).any():
+            return Repeated((), np.ones(len(scan), bool))
+        same = scan == earlier[-1]
+        if np.count_nonzero(same) < self._sizes.min():
+            return Repeated((), np.zeros(len(scan), bool))
         whole = self._parts @ same.astype(int) == self._sizes
         others = same[~self._parts[whole].any(axis=0)]
         by_chance = (np.count_nonzero(others) + 1) / (len(others) + 2)
@@ -59,9 +75,8 @@ class Repeats:
         return Repeated(tuple(self._names[whole].tolist()), self._parts[whole].any(axis=0))
 
 
-def _is_noisy(reference: Reference | None, channel: Channel, scan: FloatArray) -> bool:
+def _is_noisy(reference: Reference | None, noise: FloatArray | None, scan: FloatArray) -> bool:
     """Whether scans at rest differed in most voltages, by more than a mean of equals rounds."""
-    noise: Any = getattr(reference, f"{channel}_noise", None)
     if reference is None or not reference.is_noise_measured or noise is None:
         return False
     differs = bool(2 * np.count_nonzero(noise) > len(noise))

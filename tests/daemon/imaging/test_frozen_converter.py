@@ -1,4 +1,4 @@
-"""Scans that repeat bit for bit were not measured: the channel is missing, and told."""
+"""Scans that repeat earlier ones were not measured: the channel is missing, and told."""
 
 from __future__ import annotations
 
@@ -42,6 +42,20 @@ def test_a_frozen_channel_is_missing_and_told(bench: Start, frozen: tuple[Channe
     b.listener.event("converter_back")
     names = [event["name"] for event in b.listener.of("event")]
     assert names.count("converter_frozen") == len(frozen)
+
+
+def test_a_round_of_buffers_that_are_sent_again_is_no_measurement(bench: Start) -> None:
+    b = bench(ports=2, lossless=True)
+    b.tare()
+    for number in range(9):
+        b.skin.counter += 1
+        for channel in BOTH:
+            fresh = scan(channel, b.skin.counter, REST * 1.1)
+            old = replace(scan(channel, number % 3), counter=fresh.counter)
+            b.skin.line_of(channel).say(replace(old, device_us=fresh.device_us))
+        frame = b.listener.frame(b.skin.counter)
+        assert number < 3 or {"magnitude_missing", "structure_missing"} <= set(frame["flags"])
+    assert b.step(0.1)["flags"] == []
 
 
 def test_drives_that_repeat_are_left_out_and_the_rest_is_imaged(bench: Start) -> None:

@@ -104,6 +104,17 @@ def test_a_tare_under_a_press_is_disputed_until_the_skin_is_at_rest(
     assert pressed(b.step(0.2)) > 0.09, "measured against the skin at rest again"
 
 
+def test_a_light_press_is_no_rest_by_the_reference_before_the_tare(
+    bench: Callable[..., Any],
+) -> None:
+    b = bench()
+    b.tare()
+    b.step(0.2)
+    tare_under(b, 5e-4)  # 0.05 % of the voltages: 20 times the noise
+    assert b.step(5e-4)["flags"] == ["reference_disputed"]
+    assert b.step(0.0)["flags"] == []
+
+
 def test_a_second_tare_with_nothing_shown_settles_it(bench: Callable[..., Any]) -> None:
     b = bench()
     b.tare()
