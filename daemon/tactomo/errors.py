@@ -1,18 +1,5 @@
 """What can go wrong in the daemon and its tools, each with a name, a cause and a next step.
 
-TactomoError
-├── ConfigError      the configuration cannot be used: `tactomo daemon skin.toml` where the file
-│                    is not TOML, has an unknown key or a value out of range
-├── PortError        a serial port cannot be used: it is no serial device, may not be opened by
-│   │                this user
-│   ├── PortAbsentError  ... or is not there: the cable is out, the path has a typing error
-│   └── PortBusyError    ... or another process holds it: a terminal program was left open
-├── AddressError     a socket cannot be bound: a second daemon runs with the same configuration
-├── CommandError     a control command was refused: its argument is out of range, or there is
-│                    nothing to tare against yet
-├── RecordingError   a recording cannot be written or read: the disk is full, the file is not MCAP
-└── ServiceError     the service cannot be installed: this is not root, or not systemd's computer
-
 They are raised for what a user can cause. A program shows `cause` and `next_step` and exits with
 status 1; a traceback is for a mistake of ours.
 """
@@ -46,14 +33,12 @@ def needs(what: str, install: str) -> Iterator[None]:
 
 
 @contextmanager
-def os_errors_as(
-    kind: type[TactomoError], cause: str, next_step: str, name: str | None = None
-) -> Iterator[None]:
+def os_errors_as(kind: type[TactomoError], cause: str, next_step: str) -> Iterator[None]:
     """Raise `kind` where the operating system refuses what a block does, with its reason."""
     try:
         yield
     except OSError as error:
-        raise kind(f"{cause}: {error.strerror or error}", next_step, name) from error
+        raise kind(f"{cause}: {error.strerror or error}", next_step) from error
 
 
 class ConfigError(TactomoError):

@@ -40,11 +40,6 @@ class Feed:
             sensor, address=address, kind=("map", "status", "event"), keys=keys
         )
 
-    @property
-    def malformed(self) -> int:
-        """Messages that were skipped because they broke the rules."""
-        return self._news.malformed
-
     async def run(self) -> None:
         """Read until cancelled, then close the subscription."""
         async with self._news:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from tactomo_lab.evaluation.paper import Arrangement, Frame, Rig
 
-FIGURES = (5, 7, 8, 9, 10, 11, 12)
+FIGURES = (5, 8, 9, 10, 11, 12)
 
 
 @dataclass(frozen=True)
@@ -59,13 +59,13 @@ app = options.typer_app()
 def paper(
     figure: Annotated[
         str, typer.Option(help="The paper's figures, with commas.")
-    ] = "5,7,8,9,10,11,12",
+    ] = "5,8,9,10,11,12",
     count: Annotated[
         int, typer.Option(min=1, help="Fig. 5: scenes of each number of contacts.")
     ] = 100,
-    sheets: Annotated[int, typer.Option(min=1, help="Figs. 7 to 12: sensors to press.")] = 3,
+    sheets: Annotated[int, typer.Option(min=1, help="Figs. 8 to 12: sensors to press.")] = 3,
     snr: Annotated[
-        float, typer.Option(help="Figs. 7 to 12: SNR of the voltages at rest, in dB.")
+        float, typer.Option(help="Figs. 8 to 12: SNR of the voltages at rest, in dB.")
     ] = 60.0,
     method: Annotated[
         list[str] | None,
@@ -77,7 +77,7 @@ def paper(
 ) -> None:
     """Repeat the paper's evaluation on simulated skins, beside the paper's printed numbers.
 
-    The paper's Figs. 7 to 12 were measured on hardware; tactomo's figures are simulated, on sheets
+    The paper's Figs. 8 to 12 were measured on hardware; tactomo's figures are simulated, on sheets
     uneven by 5 % with noise on every voltage. Fig. 5 is simulated in both: even sheets, ellipses
     that conduct worse than the sheet, white noise relative to the rms of the voltage changes. The
     first run simulates (half a second a scene) and keeps the voltages in the cache.
@@ -150,24 +150,6 @@ def _simulation_study(study: _Study, asked: set[int]) -> _Part:
         made,
         "",
         {5: [asdict(point) for point in points]},
-    )
-
-
-def _response_test(study: _Study, asked: set[int]) -> _Part:
-    from tactomo_lab.evaluation.paper import RESPONSE_KPA, measure_response
-
-    total = len(RESPONSE_KPA) * len(study.rigs)
-    points = list(shown(measure_response(study.rigs), total, "Fig. 7"))
-    made = table("pressure, kPa", "magnitude channel", "structure channel")
-    for kpa in RESPONSE_KPA:
-        at = [point for point in points if point.pressure_kpa == kpa]
-        values = [[point.peak[name] for point in at] for name in study.description.channels]
-        made.add_row(f"{kpa:g}", *(_mean_and_deviation(of, "{:.4f}") for of in values))
-    return _Part(
-        "Fig. 7: largest value of the Tikhonov image at (36, 36) mm, simulated",
-        made,
-        "",
-        {7: [asdict(point) for point in points]},
     )
 
 
@@ -292,7 +274,6 @@ def _several_areas(study: _Study, asked: set[int]) -> _Part:
 
 EXPERIMENTS: dict[tuple[int, ...], Callable[[_Study, set[int]], _Part]] = {
     (5,): _simulation_study,
-    (7,): _response_test,
     (8, 9): _single_areas,
     (10,): _localisation,
     (11, 12): _several_areas,
@@ -323,7 +304,7 @@ def _print_settings(settings: dict[str, Any]) -> None:
     console = Console()
     console.print(
         f"Ours are simulated, not measured: {settings['sensor']}, {settings['seeds']} seeds; "
-        f"Figs. 7 to 12 on {settings['sheets']} uneven sheet(s), "
+        f"Figs. 8 to 12 on {settings['sheets']} uneven sheet(s), "
         f"{settings['snr_of_voltages_db']:g} dB of the voltages at rest, one scan a press."
     )
     for method, why in settings["left_out"].items():

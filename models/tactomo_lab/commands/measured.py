@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
@@ -13,7 +12,7 @@ from tactomo.cli.options import Description, JsonOutput, examples, typer_app
 from tactomo.cli.output import say, table
 from tactomo.errors import TactomoError
 
-from tactomo_lab.commands.report import Picture, shown, tell
+from tactomo_lab.commands.report import shown, tell
 
 if TYPE_CHECKING:
     from tactomo.cli.console import Console
@@ -246,7 +245,7 @@ def _mean(values: Sequence[float]) -> float:
 
 @app.command(
     epilog=examples(
-        "tactomo evaluate ktc ktc2023_training.npz --picture ktc.png",
+        "tactomo evaluate ktc ktc2023_training.npz",
         "tactomo evaluate ktc ktc2023_training.npz --level 7 --json",
     )
 )
@@ -257,7 +256,6 @@ def ktc(
         typer.Option(min=1, max=7, help="Leave out the electrodes that this level has lost."),
     ] = None,
     sensor: Description = "tank_ktc2023",
-    picture: Picture = None,
     as_json: JsonOutput = False,
 ) -> None:
     """Segment tanks of the Kuopio Tomography Challenge 2023, and score them by its rules.
@@ -272,7 +270,6 @@ def ktc(
     the objects until they explain the voltages. Level l of 1 to 7 loses the first 2 (l - 1)
     electrodes.
     """
-    from tactomo_lab.commands.pictures import draw_tanks
     from tactomo_lab.evaluation.ktc import evaluate_challenge, read_challenge
 
     description = tank_of(sensor)
@@ -294,7 +291,7 @@ def ktc(
         console.print(made)
 
     told = {"simulated": False, "score": total, "tanks": each}
-    tell(told, as_json, show, picture, partial(draw_tanks, given.truth, tanks))
+    tell(told, as_json, show)
 
 
 @app.command(

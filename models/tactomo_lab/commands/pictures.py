@@ -15,10 +15,8 @@ from tactomo_models.scene.press import strongest
 if TYPE_CHECKING:
     from numpy.typing import NDArray
     from tactomo_models import SensorDescription
-    from tactomo_models.arrays import Image
 
     from tactomo_lab.evaluation.drifting import Day, Seen
-    from tactomo_lab.evaluation.ktc import ChallengeOutcome
     from tactomo_lab.evaluation.play import Outcome
     from tactomo_lab.evaluation.stability import Trust
 
@@ -185,21 +183,6 @@ def draw_day(day: Day, seen: dict[str, list[Seen]], output: Path) -> None:
     axes[2].set_xlabel("hours since the tare; grey: something presses (simulated)")
     axes[2].set_xlim(hours[0], hours[-1])
     axes[2].legend(loc="center right")  # framed: nothing says where ghosts leave room
-    save_figure(figure, output)
-
-
-def draw_tanks(truths: Image, tanks: Sequence[ChallengeOutcome], output: Path) -> None:
-    """Draw the truth above what was found, a column for each tank."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(1.5 * len(tanks), 3.2), layout="constrained")
-    panels: Any = figure.subplots(2, len(tanks), squeeze=False)
-    for column, (truth, tank) in enumerate(zip(truths, tanks, strict=True)):
-        for panel, image in zip(panels[:, column], (truth, tank.image), strict=True):
-            panel.imshow(image, vmin=0, vmax=2)
-            panel.set_axis_off()
-        panels[0, column].set_title(f"level {tank.level}", fontsize=7)
-        panels[1, column].set_title(f"{tank.score:.3f}", fontsize=7)
     save_figure(figure, output)
 
 

@@ -4,7 +4,7 @@ Its simulation study (Fig. 5) is repeated as it is described: one to four ellips
 worse than an even sheet, a contrast of 100 in the structure channel, white Gaussian noise. "SNR of
 the data" is read as that of the voltage *changes*, which are the data of its equations.
 
-Its experiments (Figs. 7 to 12) were made with hardware: round indenters on a real skin. Here they
+Its experiments (Figs. 8 to 12) were made with hardware: round indenters on a real skin. Here they
 are made with simulated ones, `Rig`: sheets uneven by 5 %, contact impedances by 20 %, conductivity
 that rises under pressure, noise of equal size on every voltage, one scan a press after one tare.
 The paper has one sensor; here several sheets tell what is chance.
@@ -22,7 +22,6 @@ from typing import Any, Final
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 from tactomo_models.arrays import FloatArray
-from tactomo_models.physics.artifact import load_or_build_artifact
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scene.contacts import Contact
 from tactomo_models.scene.press import Press
@@ -58,7 +57,6 @@ SCENES: Final = 100  # of each number of contacts, likewise
 
 PAPER_WIDTH_MM: Final = 150.0  # places and sizes are shares of it on another sensor
 RIG_SNR_DB: Final = 60.0  # of the voltages at rest: a tank that was measured had 58
-RESPONSE_KPA: Final = tuple(float(kpa) for kpa in range(0, 201, 20))  # of Fig. 7
 CASE_KPA: Final = (140.0, 160.0, 180.0, 200.0)  # of Figs. 8 and 9
 TOP_SHARE: Final = 0.75  # of an image's maximum, above which values are averaged (V-C-2)
 GRID_MM: Final = 18.0  # of the holes that indenters are held by
@@ -126,7 +124,7 @@ def cells(outcomes: Iterable[Outcome]) -> list[Cell]:
     return [Cell(*key, summarise(of_cell)) for key, of_cell in scores.items()]
 
 
-# ------------------------------------------------------------------ Figs. 7 to 12: experiments
+# ------------------------------------------------------------------ Figs. 8 to 12: experiments
 
 
 @dataclass(frozen=True)
@@ -186,7 +184,6 @@ PLACES_MM: Final = tuple(product(GRID_MM * np.arange(-2, 3), repeat=2))
 LOCALISATION: Final = tuple(
     Arrangement(0, (Area(float(x_mm), float(y_mm)),), ((HIGH,),)) for y_mm, x_mm in PLACES_MM
 )
-RESPONSE: Final = Arrangement(0, (Area(36, 36),), tuple((kpa,) for kpa in RESPONSE_KPA))
 
 
 def presses_of(
@@ -251,32 +248,6 @@ class Rig:
             *(self._seed_set, self.sheet, simulated.plan, simulated.told, simulated.true),
             *(self.tare, [frame]),
         )
-
-
-@dataclass(frozen=True)
-class Response:
-    """A point of Fig. 7; `peak` is the largest value of each channel's Tikhonov image."""
-
-    sheet: int
-    pressure_kpa: float
-    peak: dict[Channel, float]
-
-
-def measure_response(rigs: Iterable[Rig]) -> Iterator[Response]:
-    """Fig. 7: what each channel shows of a growing pressure in a sensitive place."""
-    matrix: FloatArray | None = None
-    for rig in rigs:
-        if matrix is None:
-            matrix = load_or_build_artifact(rig.description).tikhonov
-        rest: Volts = {n: v for n in BOTH_CHANNELS if (v := getattr(rig.tare, n)) is not None}
-        for (kpa,) in RESPONSE.pressures_kpa:
-            case = rig.press(presses_of(rig.description, RESPONSE, (kpa,)) if kpa else ())
-            scan = case.frames[0].scans
-            # Both conduct better under pressure as shipped; else the image is turned over.
-            changes = {n: (scan[n] - rest[n]) / np.abs(rest[n]) for n in BOTH_CHANNELS}
-            signs = {n: rig.description.sign(n) for n in BOTH_CHANNELS}
-            peak = {n: float((matrix @ (signs[n] * changes[n])).max()) for n in BOTH_CHANNELS}
-            yield Response(rig.sheet, kpa, peak)
 
 
 @dataclass(frozen=True)

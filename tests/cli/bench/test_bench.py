@@ -13,7 +13,6 @@ Run = Callable[..., Any]
 @pytest.mark.parametrize(
     "options",
     [
-        ["--show"],
         ["--machine-speed", "--chart", "chart.png"],
         ["--method", "tikhonov"],
     ],

@@ -77,7 +77,6 @@ app = options.typer_app()
         "tactomo bench --chart speed_accuracy.png --count 25",
         "tactomo bench --chart mine.png --method my_module:MyMethod --method auto",
         "tactomo bench --machine-speed",
-        "tactomo bench --machine-speed --show",
     )
 )
 def bench(
@@ -119,14 +118,6 @@ def bench(
             "daemons that start from now on.",
         ),
     ] = False,
-    show: Annotated[
-        bool,
-        typer.Option(
-            "--show",
-            rich_help_panel=SPEED,
-            help="With --machine-speed: only show the speed in use.",
-        ),
-    ] = False,
     as_json: options.JsonOutput = False,
 ) -> None:
     """Measure latency and rate on this machine, or the accuracy of methods over their time.
@@ -144,8 +135,6 @@ def bench(
     of time on this machine. Takes about half a minute; leave the machine alone meanwhile. A service
     has a cache of its own: set CACHE_DIRECTORY to that cache.
     """
-    if show and not machine_speed:
-        raise typer.BadParameter("--show goes with --machine-speed")
     if machine_speed and chart is not None:
         raise typer.BadParameter("use --machine-speed and --chart in separate runs")
     if method and chart is None:
@@ -155,7 +144,7 @@ def bench(
         _chart(results, chart, count, method or [], as_json)
         return
     if machine_speed:
-        _machine_speed(results, show, as_json)
+        _machine_speed(results, as_json)
         return
     from tactomo.cli.console import Console
 
@@ -178,12 +167,11 @@ def _chart(results: Results, picture: Path, count: int, methods: list[str], as_j
         _console(results).print(fronts)
 
 
-def _machine_speed(results: Results, show: bool, as_json: bool) -> None:
-    """Measure what a time buys on this machine, or show what was measured."""
+def _machine_speed(results: Results, as_json: bool) -> None:
+    """Measure what a time buys on this machine."""
     from tactomo.cli.bench import machine_speed as bench_machine_speed
 
-    name = results.description
-    made = bench_machine_speed.in_force(name) if show else bench_machine_speed.measure(name)
+    made = bench_machine_speed.measure(results.description)
     if as_json:
         say(made.model_dump_json(indent=2))
         return

@@ -22,7 +22,6 @@ from tactomo_models import (
 from tactomo_models.arrays import FloatArray
 from tactomo_models.methods.machine_speed import (
     MachineSpeed,
-    machine_speed_for,
     machine_speed_path,
     save_machine_speed,
 )
@@ -115,12 +114,6 @@ def warned_if_busy() -> Iterator[list[str]]:
         )
         warnings.append(busy)
         say(f"{busy}; run it again when nothing else runs", err=True)
-
-
-def in_force(name: str) -> MachineSpeed:
-    """Return what a daemon would use, and say on standard error why, if need be."""
-    console = Console(stderr=True)
-    return machine_speed_for(load_description(name), lambda why: console.print(why, soft_wrap=True))
 
 
 def table_of(speed: MachineSpeed) -> Table:

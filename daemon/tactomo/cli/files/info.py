@@ -32,7 +32,7 @@ def info(
         str,
         typer.Argument(
             help="A recording (.mcap), a folder of them, a file that `tactomo reconstruct` reads "
-            "(.npz, .mat, .csv, .eit), a built artifact (.npz), a calibration (.json), or a sensor "
+            "(.npz, .mat, .csv, .eit), a built artifact (.npz), or a sensor "
             "description: a shipped name or a TOML file."
         ),
     ],
@@ -110,9 +110,6 @@ def _facts(what: str) -> dict[str, Any]:
 
     if suffix in (".npz", ".eit", *READERS) or Path(what).is_dir():
         return _array_facts(Path(what))
-    if suffix == ".json":
-        return _calibration_facts(Path(what))
-
     return _description_facts(load_description(what))
 
 
@@ -155,26 +152,6 @@ def _array_facts(path: Path) -> dict[str, Any]:
         name: f"{array.dtype} {array.shape}" for name, array in arrays.items() if array.ndim > 0
     }
     return {"kind": kind, "bytes": path.stat().st_size, **facts, "arrays": shapes}
-
-
-def _calibration_facts(path: Path) -> dict[str, Any]:
-    from tactomo_models import CalibrationError
-    from tactomo_models.calibration.calibration_file import read_calibration
-
-    try:
-        made = read_calibration(path)
-    except FileNotFoundError as error:
-        raise CalibrationError(
-            f"there is no file {path}; give the path of a calibration"
-        ) from error
-    subject = made.subject
-    return {
-        "kind": "pressure calibration",
-        "sensor": subject.sensor,
-        "description": subject.description,
-        "devices": list(subject.device_ids),
-        "rests on": made.words,
-    }
 
 
 def _description_facts(description: SensorDescription) -> dict[str, Any]:
