@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 app = typer_app()
 
-TRAINED: Final = (100, 200, 800)  # presses learnt from
-
 
 class Measured(NamedTuple):
     """What a set shows: its figure, tables with their captions, all for programs."""
@@ -35,33 +33,14 @@ class Kind(NamedTuple):
     """A kind of measured sets.
 
     Attributes:
-        arrays: what sets of the kind are recognised by: how their arrays' names end.
-        description: the shipped sensor that public sets are of; nothing where none has to be known.
+        arrays: what sets of the kind are recognised by: the names of their arrays.
+        description: the shipped sensor that public sets are of.
         measure: what measures a set, of its path and its sensor.
     """
 
     arrays: tuple[str, ...]
     description: str
     measure: Callable[[Path, str], Measured]
-
-
-def challenge(path: Path, sensor: str) -> Measured:
-    """Score the challenge's tanks at each level."""
-    from tactomo_lab.evaluation.ktc import evaluate_challenge, read_challenge
-
-    tank = tank_of(sensor)
-    given = read_challenge(path, tank)
-    levels = shown(range(1, 8), 7, "levels")
-    tanks = [list(evaluate_challenge(given.at_level(level), tank)) for level in levels]
-    means = [_mean([one.score for one in level]) for level in tanks]
-    seconds = _mean([one.seconds for level in tanks for one in level])
-    count = len(tanks[0])
-    details = [
-        f"Mean score of {count} tanks without the first 2 (level - 1) electrodes:",
-        *_table(["level", *map(str, range(1, 8))], [["score", *(f"{m:.3f}" for m in means)]]),
-        f"{seconds:.1f} s a tank on one core (processor time).",
-    ]
-    return Measured(f"{3 * sum(means):.1f} of 21", details, {"score_by_level": means})
 
 
 def tank_of(sensor: str) -> SensorDescription:
@@ -139,31 +118,9 @@ def round_skin(path: Path, sensor: str) -> Measured:
     )
 
 
-def soft_skins(path: Path, sensor: str) -> Measured:
-    """Learn skins from their first presses, and locate the last 800; of any make."""
-    from tactomo_lab.evaluation.taught_presses import judge, read_skins
-
-    skins, rows, means = read_skins(path), [], []
-    for train in TRAINED:
-        found = list(shown(judge(skins, train), len(skins), f"skins, {train} presses"))
-        means.append(_mean([one.median_mm for one in found]))
-        medians = [f"{one.median_mm:.1f}" for one in found]
-        rows.append([str(train), *medians, f"{means[-1]:.1f}"])
-    return Measured(
-        f"{means[-1]:.1f} mm (mean of medians)",
-        [
-            "Median error, mm, by presses learnt from:",
-            *_table(["presses", *(skin.name for skin in skins), "mean"], rows),
-        ],
-        {"mean_median_mm": dict(zip(map(str, TRAINED), means, strict=True))},
-    )
-
-
 KINDS: Final = (
-    Kind(("injection", "measurement", "reference", "voltages", "truth"), "tank_ktc2023", challenge),
     Kind(("dv", "truth", "name"), "tank_uef2017", saline_tanks),
     Kind(("lookup", "dv", "pos_m"), "skin_round", round_skin),
-    Kind(("_voltages", "_xy_mm"), "", soft_skins),
 )
 
 
@@ -192,19 +149,12 @@ def measured(
     image with the truth over the disc; the network's confidence is the expected correlation.
     *Presses of a robot*: `lookup` (M, 4), the source, sink, v+ and v- electrode of each voltage;
     `dv` (n, M); `pos_m` (n, 2), the places in the robot's frame. Some presses fit the skin's place
-    in that frame, the others judge it. *Tanks of the Kuopio Tomography Challenge* and *presses on
-    unknown skins*: as for `tactomo evaluate ktc` and `presses`, at every level and after 100, 200
-    and 800 presses.
-
-    The public sets are ktc2023_training.npz, tank_uef2017.npz, skin_round_presses.npz and
-    skins_anisotropy.npz; docs/measured.md has the best published figures beside ours. All four
-    take two minutes of one core.
+    in that frame, the others judge it. `tactomo evaluate ktc` and `presses` take the other sets of
+    docs/measured.md, which has the best published figures beside ours.
     """
     from threadpoolctl import threadpool_limits
 
     kind = _recognised(path)
-    if sensor is not None and not kind.description:
-        raise typer.BadParameter("--description: presses alone are learnt from; leave it out")
     say(f"measuring {path.name}", err=True)
     with threadpool_limits(1):  # more threads wait for each other where others compute, too
         found = kind.measure(path, sensor or kind.description)
@@ -222,7 +172,7 @@ def _recognised(path: Path) -> Kind:
 
     names = list(read_set(path, "measured scans"))
     for each in KINDS:
-        if all(any(name.endswith(array) for name in names) for array in each.arrays):
+        if set(each.arrays) <= set(names):
             return each
     known = "; ".join(", ".join(each.arrays) for each in KINDS)
     raise TactomoError(
