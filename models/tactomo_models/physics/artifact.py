@@ -216,33 +216,24 @@ def _from_arrays(arrays: dict[str, FloatArray], description: SensorDescription) 
 
 
 def load_or_build_artifact(
-    description: SensorDescription, path: Path | None = None, progress: Progress | None = None
+    description: SensorDescription, progress: Progress | None = None
 ) -> Artifact:
-    """Read the sensor's artifact, or build and keep it where it is missing.
+    """Read the sensor's artifact from the user's cache, or build and keep it there.
 
     Args:
         description: the sensor.
-        path: the file; a place in the user's cache if None.
         progress: called with a short text at the start of each step of a build, and before it with
             why a file in the cache is not used.
-
-    Raises:
-        ArtifactError: the file that was named is damaged or built for another sensor, or cannot
-            be written. In the cache it is built anew.
     """
-    target = path or default_path(description)
+    path = default_path(description)
     try:
-        return load_artifact(target, description)
+        return load_artifact(path, description)
     except ArtifactError as error:
-        if path is not None and path.exists():
-            raise  # what was asked for by name is not replaced; what is in the cache is
-        if progress is not None and target.exists():
+        if progress is not None and path.exists():
             progress(f"{error}: it is built anew")
     artifact = build_artifact(description, progress)
     try:
-        save_artifact(artifact, target)
-        return load_artifact(target, description)  # what is large stays in the file
+        save_artifact(artifact, path)
+        return load_artifact(path, description)  # what is large stays in the file
     except ArtifactError:
-        if path is not None:
-            raise  # the cache is a convenience, a path that was asked for is not
-        return artifact
+        return artifact  # the cache is a convenience

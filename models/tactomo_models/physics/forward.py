@@ -154,9 +154,7 @@ class ForwardModel:
         left = np.abs(law @ self.bare.potentials).max(axis=1)
         self._closed = left < 1e-9 * (abs(law) @ np.abs(self.bare.potentials)).max(axis=1)
 
-    def solve(
-        self, change: FloatArray, *, mix_resistivities: bool = False, within: IntArray | None = None
-    ) -> Solution:
+    def solve(self, change: FloatArray, *, mix_resistivities: bool = False) -> Solution:
         """Solve for a pressed sheet.
 
         Args:
@@ -166,14 +164,11 @@ class ForwardModel:
                 meets the two in series: there this keeps an edge where its nodes put it, whatever
                 the contrast (to 0.3 mm of 3 mm triangles; otherwise it is off by up to 0.9 mm).
                 Triangles with a corner that conducts worse than the sheet mix conductivities.
-            within: pressable nodes outside of which nothing changes; those that change if None.
-                Solves that share them share what is found out about them.
 
         Raises:
             numpy.linalg.LinAlgError: a conductivity is not above 0.
         """
-        where = np.flatnonzero(change) if within is None else within
-        areas = self._compiled.areas(where)
+        areas = self._compiled.areas(np.flatnonzero(change))
         return self._compiled.solve(areas, None, None, change, mix_resistivities=mix_resistivities)[
             0
         ]

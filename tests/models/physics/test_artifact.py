@@ -55,8 +55,6 @@ def test_an_artifact_comes_back_as_it_was(
 def test_an_artifact_of_another_sensor_is_refused(file: Path, paper: SensorDescription) -> None:
     with pytest.raises(ArtifactError, match=r"built for.*'small'.*'paper_square'.*models build"):
         load_artifact(file, paper)
-    with pytest.raises(ArtifactError):
-        load_or_build_artifact(paper, file)
 
 
 @pytest.mark.parametrize(
@@ -169,14 +167,14 @@ def test_a_missing_one_is_built_and_kept(small: SensorDescription) -> None:
 
 
 def test_a_cache_that_cannot_be_written_does_not_stop_anybody(
-    small: SensorDescription, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small: SensorDescription, built: Artifact, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("a file where a folder should be")
     monkeypatch.setenv("CACHE_DIRECTORY", str(blocked))
     assert load_or_build_artifact(small).sensor == "small"
     with pytest.raises(ArtifactError, match="cannot write"):
-        load_or_build_artifact(small, blocked / "asked_for.npz")
+        save_artifact(built, blocked / "asked_for.npz")
 
 
 def test_tikhonov_is_equation_4_on_whitened_data(built: Artifact, small: SensorDescription) -> None:

@@ -192,7 +192,7 @@ def test_voltages_converge_and_the_jacobian_passes_a_taylor_test(
     step[where] = 0.1 * change[where] * np.random.default_rng(0).uniform(-1, 1, len(where))
     left = [
         np.linalg.norm(
-            forward.solve(change + size * step, within=where).voltages
+            forward.solve(change + size * step).voltages
             - solution.voltages
             - size * jacobian @ step[where]
         )
