@@ -342,7 +342,7 @@ def import_anything(path: Path) -> bool:
         times_s = scans.times(20.0 if scans.time_s is None else None)
         assert np.isfinite(times_s).all()
         assert (np.diff(times_s) >= 0).all()
-        for time_s, packet in scans.packets(times_s):
+        for time_s, packet in scans.packets(times_s, TANK):
             assert time_s >= 0
             encode(packet)
         return True
