@@ -127,6 +127,32 @@ def test_a_sheet_of_another_outline_is_described_and_drawn(newcomer: Newcomer) -
         assert sum(isinstance(each, Pad) for each in pads) == 1
 
 
+@pytest.mark.slow
+def test_an_insole_goes_from_a_drawing_to_contacts_in_ros(newcomer: Newcomer) -> None:
+    section = "An insole on a curved sole"
+    drawing, surface, reader = PAGE.blocks("python", section)
+    keys = PAGE.blocks("toml", section)
+    draw = PAGE.commands(section)[:2]
+    info, demo, press, watch, *files = PAGE.commands(section)[2:]
+    with newcomer:
+        newcomer.python(drawing)
+        newcomer.follow(draw)
+        newcomer.python(surface)
+        sheet = newcomer.folder / "my_sole.toml"
+        sheet.write_text(sheet.read_text() + "\n" + "".join(keys))
+        assert "surface on right_foot_link" in newcomer.run(info)
+        newcomer.run(demo)
+        newcomer.run(press)
+        newcomer.wait_for(watch, " mm ")
+        newcomer.follow(files)
+        assert "right_foot_link" in newcomer.python(reader)
+    with (newcomer.folder / "walk.csv").open(newline="") as table:
+        last = list(csv.DictReader(table))[-1]
+    place = [float(last[f"position_{axis}_m"]) for axis in "xyz"]
+    assert place == pytest.approx((0, 0.098, 0.0135), abs=1.5e-3)  # as the page says
+    assert float(last["force_n"]) == pytest.approx(90, rel=0.05)
+
+
 def test_what_is_refused_is_refused_in_the_pages_words(tmp_path: Path) -> None:
     right = PAGE.file(FILE)
     for written, wrong in (
