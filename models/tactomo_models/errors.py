@@ -74,8 +74,12 @@ def explain(item: "ErrorDetails") -> str:
     if isinstance(item["input"], dict):  # from a section's own check: its text opens with the key
         return f"{key}.{message}"
     is_beyond = item["type"].startswith(("less_than", "greater_than"))
-    if re.search(r"_m(\.\d+)*$", key) and is_beyond and abs(item["input"]) > 1:  # in metres
-        message += f"; in millimetres? {item['input']:g} mm are {item['input'] * 1e-3:g} m"
+    if re.search(r"_m(\.\d+)*$", key) and is_beyond:  # in metres
+        value = item["input"]
+        if abs(value) > 1:
+            message += f"; in millimetres? {value:g} mm are {value * 1e-3:g} m"
+        elif value > 0:
+            message += f"; lengths are metres: {value * 1e6:g} mm are {value * 1e3:g} m"
     return f"{key} = {given}: {message}"
 
 

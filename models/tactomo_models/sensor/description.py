@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import Annotated, Literal, Self, overload
 
 import numpy as np
+import shapely
 from pydantic import Field, model_validator
 from tactomo_protocol import Channel
 
@@ -156,6 +157,14 @@ class SensorDescription(Section):
             x_m, y_m = (each.ravel() for each in np.meshgrid(self.map_x_m, self.map_y_m))
             nodes_m = np.stack([x_m, y_m], axis=-1)[self.on_sheet(x_m, y_m)]
             self.mount.check(self.sheet.size_m, nodes_m)
+        for name, companion in self.companion.items():
+            if companion.region_m is not None:
+                region = shapely.Polygon(companion.region_m)
+                if region.intersection(self.sheet.outline.polygon).area == 0:
+                    raise ValueError(
+                        f"companion.{name}.region_m lies off the sheet and feels nothing: move it, "
+                        "or leave it out for the whole sheet"
+                    )
         if self.off_sheet is not None and (~self.off_sheet).sum() < MIN_NODES:
             raise ValueError(
                 f"map: {(~self.off_sheet).sum()} of its nodes lie on the sheet, and {MIN_NODES} "

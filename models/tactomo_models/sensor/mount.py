@@ -19,6 +19,8 @@ from tactomo_models.sensor.sheet import Metres
 from tactomo_models.sensor.wavefront import Triangles, read_obj
 
 Vector = Annotated[tuple[float, float, float], Field(strict=False)]
+Coordinate = Annotated[float, Field(ge=-10, le=10)]
+Point = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
 Quaternion = Annotated[tuple[float, float, float, float], Field(strict=False)]
 
 UNIT_TOLERANCE: Final = 1e-3  # of a unit vector's length: three decimals are enough
@@ -46,7 +48,7 @@ def _told(vector: FloatArray) -> str:
 class PlaneMount(Section):
     """A flat sheet: where its middle is, and how it is turned (x, y, z, w)."""
 
-    position_m: Vector = (0.0, 0.0, 0.0)
+    position_m: Point = (0.0, 0.0, 0.0)
     quaternion: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
     @model_validator(mode="after")
@@ -89,7 +91,7 @@ class CylinderMount(Section):
     """
 
     radius_m: Metres
-    position_m: Vector = (0.0, 0.0, 0.0)
+    position_m: Point = (0.0, 0.0, 0.0)
     axis: Vector = (0.0, 0.0, 1.0)
     seam: Vector = (-1.0, 0.0, 0.0)
     along: Literal["x", "y"] = "y"
@@ -204,6 +206,12 @@ class SurfaceMount(Section):
             raise ValueError(
                 f"{name}: its texture coordinates span {span[0]:.4g} x {span[1]:.4g}, the sheet "
                 f"{size[0]:g} x {size[1]:g} m: in millimetres? divide them (vt) by 1000"
+            )
+        if (span < size / MILLIMETRES).any():
+            raise ValueError(
+                f"{name}: its texture coordinates span {1e3 * span[0]:.4g} x {1e3 * span[1]:.4g} "
+                f"mm, the sheet {1e3 * size[0]:g} x {1e3 * size[1]:g} mm; multiply them (vt) by "
+                "1000, or give the sheet's true lengths"
             )
         if np.allclose((low, high), ((0, 0), (1, 1)), atol=0.02) and (size < 0.9).any():
             raise ValueError(

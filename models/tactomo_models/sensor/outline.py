@@ -138,6 +138,8 @@ def polygon_outline(
             raise ValueError(f"{key} lies outside outline_m: leave it out, or move it")
         if not rest.contains_properly(hole):
             after = rest.difference(hole)
+            if after.is_empty:
+                raise ValueError(f"{key} covers the whole sheet: check its lengths")
             if len(shapely.get_parts(after)) > 1:
                 raise ValueError(
                     f"{key} cuts the sheet in two, and no current crosses it: describe each part "

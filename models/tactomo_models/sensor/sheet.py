@@ -40,6 +40,9 @@ Place = Annotated[
 Ring = Annotated[tuple[Place, ...], Field(min_length=3, strict=False)]
 
 
+MIN_POLYGON_M = 1e-3  # a smaller sheet was drawn in another unit
+
+
 class Sheet(Section):
     """The conductive sheet.
 
@@ -75,6 +78,13 @@ class Sheet(Section):
         if self.shape == "disc" and self.height_m not in (None, self.width_m):
             raise ValueError(
                 f"height_m = {self.height_m}: must be left out for a disc, width_m is its diameter"
+            )
+        if is_polygon and min(self.size_m) < MIN_POLYGON_M:
+            wide, high = self.size_m
+            raise ValueError(
+                f"outline_m: the sheet is {1e3 * wide:.4g} x {1e3 * high:.4g} mm; if this should "
+                f"be {1e6 * wide:.4g} x {1e6 * high:.4g} mm, multiply outline_m, holes_m and "
+                "positions_m by 1000"
             )
         limit = min(self.size_m) / 4
         if self.frame_width_m >= limit:
@@ -224,7 +234,7 @@ def _check_apart(outline: Outline, electrodes: list[RimElectrode | Pad]) -> None
             if first.length_m >= ring_m:
                 raise ValueError(
                     f"electrodes.length_m = {first.length_m}: more than the ring of {ring_m:.4g} m "
-                    f"that electrode {one} lies on; give a shorter one"
+                    f"that electrode {one} lies on; give a shorter one, in metres"
                 )
             apart = abs(first.middle_m - second.middle_m) % ring_m
             room = min(apart, ring_m - apart) - (first.length_m + second.length_m) / 2

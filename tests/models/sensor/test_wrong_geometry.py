@@ -1,0 +1,87 @@
+"""What users get wrong in outlines, mounts and companions is named, with the next step."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from tactomo_models import DescriptionError, load_description
+from tactomo_models.sensor.description_file import shipped_text
+
+CORNERS = "[[-0.06, -0.06], [0.06, -0.06], [0.06, 0.06], [-0.06, 0.06]]"
+SQUARE = "v {0} {0} 0\nv -{0} {0} 0\nv -{0} -{0} 0\nv {0} -{0} 0\n"
+TEXTURE = "vt {0} {0}\nvt -{0} {0}\nvt -{0} -{0}\nvt {0} -{0}\n"
+FACE = "f 1/1 2/2 3/3 4/4\n"
+CELL = "[companion.cell]\ngain_n_per_unit = 1.0\nnoise_n = 0.1\nregion_m = "
+PLANE = '[mount]\nframe = "a"\n[mount.plane]\nposition_m = '
+SURFACE = '[mount]\nframe = "a"\n[mount.surface]\nfile = "surface.obj"\n'
+
+
+def outlined(outline: str, holes: str = "[]") -> str:
+    keys = f"outline_m = {outline}\nholes_m = {holes}\n"
+    return re.sub(r"outline_m = .*?\n\]\n", keys, shipped_text("palm_l"), count=1, flags=re.S)
+
+
+def placed(first: str) -> str:
+    return shipped_text("palm_l").replace("[-0.045, -0.06]", first, 1)
+
+
+def with_tables(tables: str) -> str:
+    return f"{shipped_text('palm_l')}\n{tables}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "surface", "said"),
+    [
+        (outlined(CORNERS.replace("0.06", "60.0")), "", "in millimetres? -60 mm are -0.06 m"),
+        (outlined(CORNERS.replace("0.06", "6e-5")), "", "should be 120 x 120 mm, multiply"),
+        (shipped_text("palm_l").replace("= 0.006", "= 6e-6"), "", "6 mm are 0.006 m"),
+        (shipped_text("palm_l").replace("= 0.006", "= 6.0"), "", "give a shorter one, in metres"),
+        (outlined("[[-0.06, -0.06], [0.06, 0.06], [0.06, -0.06], [-0.06, 0.06]]"), "", "crosses"),
+        (outlined(CORNERS, f"[{CORNERS.replace('0.06', '0.1')}]"), "", "covers the whole sheet"),
+        (
+            outlined(CORNERS, "[[[-0.1, 0.01], [0.1, 0.01], [0.1, 0.02], [-0.1, 0.02]]]"),
+            "",
+            "cuts the sheet in two, and no current crosses it: describe each part",
+        ),
+        (placed("[-0.03, -0.03]"), "", "30 mm inside the rim: give pad_radius_m"),
+        (placed("[-0.1, -0.03]"), "", "40 mm off the rim: move it onto the sheet"),
+        (placed("[-0.014, -0.06]"), "", "[0] and [1] lie over each other: move one"),
+        (with_tables(PLANE + "[0, 0, 120]"), "", "in millimetres? 120 mm are 0.12 m"),
+        (
+            with_tables(SURFACE),
+            (SQUARE + FACE.replace("/1 2/2 3/3 4/4", " 2 3 4")).format(0.06),
+            "without texture coordinates",
+        ),
+        (
+            with_tables(SURFACE),
+            SQUARE.format(60) + TEXTURE.format(0.06) + FACE,
+            "vertices in millimetres? divide them (v) by 1000",
+        ),
+        (
+            with_tables(SURFACE),
+            (SQUARE + TEXTURE).format(60) + FACE,
+            "in millimetres? divide them (vt) by 1000",
+        ),
+        (
+            with_tables(SURFACE),
+            (SQUARE + TEXTURE).format(0.00006) + FACE,
+            "multiply them (vt) by 1000",
+        ),
+        (with_tables(f"{CELL}[[0.02, 0.02], [0.05, 0.02], [0.05, 0.05]]"), "", "off the sheet"),
+        (
+            with_tables(f"{CELL}[[-0.05, -0.05], [-0.01, -0.01], [-0.01, -0.05], [-0.05, -0.01]]"),
+            "",
+            "region_m crosses or touches itself",
+        ),
+    ],
+)
+def test_wrong_geometry_is_named_with_the_next_step(
+    tmp_path: Path, text: str, surface: str, said: str
+) -> None:
+    (tmp_path / "surface.obj").write_text(surface)
+    (tmp_path / "wrong.toml").write_text(text)
+    with pytest.raises(DescriptionError) as caught:
+        load_description(tmp_path / "wrong.toml")
+    assert said in str(caught.value)
