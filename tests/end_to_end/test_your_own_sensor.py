@@ -140,7 +140,9 @@ def test_an_insole_goes_from_a_drawing_to_contacts_in_ros(newcomer: Newcomer) ->
         newcomer.python(surface)
         sheet = newcomer.folder / "my_sole.toml"
         sheet.write_text(sheet.read_text() + "\n" + "".join(keys))
-        assert "surface on right_foot_link" in newcomer.run(info)
+        described = newcomer.run(info)
+        assert "surface on right_foot_link" in described
+        assert "load_cell" in described
         newcomer.run(demo)
         newcomer.run(press)
         newcomer.wait_for(watch, " mm ")

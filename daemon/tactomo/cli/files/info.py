@@ -163,6 +163,7 @@ def _description_facts(description: SensorDescription) -> dict[str, Any]:
         "sheet": f"{description.sheet.shape}, {width_mm:g} x {height_mm:g} mm",
         "electrodes": description.electrode_count,
         **({"mount": f"{mount.kind} on {mount.frame}"} if (mount := description.mount) else {}),
+        **({"companions": ", ".join(description.companion)} if description.companion else {}),
         "voltages a scan": description.measurements,
         "pattern": str(description.pattern),
         "instrument": f"{description.instrument.voltages} voltages",
