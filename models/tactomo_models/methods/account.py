@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -116,6 +117,7 @@ def laplace(
     hessian[np.diag_indices(len(hessian))] += precision
     log_evidence = likelihood.log(chi_squared) - float(precision @ offset**2) / 2
     log_evidence += log_occam(precision, hessian) + log_prior(family.split(parameters))
+    log_evidence += math.lgamma(family.count + 1)  # log K!
     return log_evidence, hessian
 
 

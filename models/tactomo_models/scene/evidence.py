@@ -1,10 +1,12 @@
 """How likely an account of a frame is: the evidence of a fitted field, by Laplace's method.
 
     log Z = log L(chi^2) - |(p - p0) / prior|^2 / 2 + log det(prior precision) / 2 - log det(H) / 2
+          + log K!
 
 A parameter pays for the share of its prior range that the data leave (Occam factor), a contact for
-the number of places where it might as well be: no account has a price of its own. Three things are
-known of a residual's errors, and L goes by them:
+the number of places where it might as well be: no account has a price of its own. Any number K of
+contacts is as likely as another; numbered otherwise they are the same contacts, so that each of K!
+orders is a maximum of its own. Three things are known of a residual's errors, and L goes by them:
 
 - Model errors go together, some voltages at a time, so that each such voltage tells less than an
   independent one (`Changes.variance_inflation`): `chi_squared` counts it for less.
@@ -13,7 +15,7 @@ known of a residual's errors, and L goes by them:
 - H is the Hessian of half of the cost at the minimum, by Gauss and Newton, on the same scale.
 
 Source: MacKay, "Bayesian interpolation", Neural Computation 4 (1992), equations 2.4 to 2.6; the
-variance: Gelman et al., "Bayesian Data Analysis" (2013), section 3.2.
+variance and the orders: Gelman et al., "Bayesian Data Analysis" (2013), sections 3.2 and 22.3.
 """
 
 from __future__ import annotations
