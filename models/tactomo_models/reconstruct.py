@@ -401,6 +401,8 @@ class Reconstructor:
         tier, flags = estimate.made_by or self._name, measurement.flags | estimate.flags
         if not contacts and not estimate.has_drifted:
             flags |= Flag.MISFIT_HIGH  # something has changed, and nothing explains it
+        if contacts and any(each.is_factor for each in measurement.changes.values()):
+            flags |= Flag.REFERENCE_MISMATCH  # one gain explains what contacts do
         if self.taught is not None and len(contacts) == 1:
             with measurement.timed("taught"):
                 contacts = (self.taught.corrected(contacts[0], measurement, tier),)

@@ -15,7 +15,7 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.compiled_sheet import CompiledData
-from tactomo_models.scans.frame_noise import noise_limit
+from tactomo_models.scans.frame_noise import CERTAIN
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.sensor.description import SensorDescription
 
@@ -67,7 +67,8 @@ class Changes:
     def is_factor(self) -> bool:
         """Whether a factor that all voltages share, such as a gain's, explains them to noise."""
         count = int(np.count_nonzero(self.precision))
-        return not self.quiet and self.signal_beyond_factor**2 * count < noise_limit(count)
+        by_noise = count + CERTAIN * (2 * count) ** 0.5
+        return not self.quiet and self.signal_beyond_factor**2 * count < by_noise
 
     def judged_by(self, error_ratio: float) -> Changes:
         """The same for a found sheet, whose errors have so many times the even one's variance."""

@@ -61,9 +61,11 @@ class Repeats:
         noise: Any = getattr(reference, f"{channel}_noise", None)
         if not len(earlier) or not _is_noisy(reference, noise, scan):
             return None
-        changes = (scan - earlier) / np.where(noise > 0, noise, np.inf)
-        squares = np.einsum("nm,nm->n", changes, changes)
-        if (squares < 2 * LEAST_NOISE**2 * np.count_nonzero(noise)).any():
+        told = np.isfinite(scan) & (noise > 0)
+        with np.errstate(over="ignore"):
+            changes = (scan[told] - earlier[:, told]) / noise[told]
+            squares = np.einsum("nm,nm->n", changes, changes)
+        if (squares < 2 * LEAST_NOISE**2 * np.count_nonzero(told)).any():
             return Repeated((), np.ones(len(scan), bool))
         same = scan == earlier[-1]
         if np.count_nonzero(same) < self._sizes.min():

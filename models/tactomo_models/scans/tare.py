@@ -244,7 +244,10 @@ class ChannelTare:
         if not quiet:
             over = 1 + (change * np.sign(self.reference))[valid]
             common = median(over) or 1.0
-            beyond = float(np.mean((over / common - 1) ** 2 / variance[valid]))
+            # A gain behind what makes the noise takes the noise along; one before leaves it.
+            scale = max(abs(common), 1.0)
+            with np.errstate(over="ignore"):  # absurd volts are no factor
+                beyond = float(np.mean((over / scale - common / scale) ** 2 / variance[valid]))
         changes = Changes(
             change=change,
             weight=valid / np.sqrt(noise + error),
