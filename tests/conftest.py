@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import random
 import shutil
@@ -45,7 +46,7 @@ BEGUN_S = pytest.StashKey[float]()
 # refused for what was there before it. For that look with `make test-random`.
 PATIENT: dict[str, Any] = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
 settings.register_profile("few", max_examples=20, derandomize=True, **PATIENT)
-settings.register_profile("many", max_examples=100, derandomize=True, **PATIENT)  # `make test-all`
+settings.register_profile("many", max_examples=50, derandomize=True, **PATIENT)  # `make test-all`
 settings.register_profile("new", max_examples=100, **PATIENT)
 settings.load_profile("few")
 
@@ -101,14 +102,23 @@ def _own_folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session")
+def _each_its_own(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Folders that nobody has used; pytest's own would be numbered by a look at all before them."""
+    parent = tmp_path_factory.mktemp("own")
+    return (parent / str(number) for number in itertools.count())
+
+
 @pytest.fixture(autouse=True)
-def _own_data(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+def _own_data(monkeypatch: pytest.MonkeyPatch, _each_its_own: Iterator[Path]) -> None:
     """What one test's daemon keeps, such as its last reference, does not get into another's.
 
     Nor is one found that another test runs.
     """
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path_factory.mktemp("data")))
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path_factory.mktemp("run")))
+    for name in ("XDG_DATA_HOME", "XDG_RUNTIME_DIR"):
+        folder = next(_each_its_own)
+        folder.mkdir(mode=0o700)
+        monkeypatch.setenv(name, str(folder))
 
 
 @pytest.fixture(scope="session", autouse=True)
