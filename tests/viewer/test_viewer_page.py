@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import io
+import itertools
 import json
 import re
 import threading
@@ -351,6 +352,21 @@ def test_a_mounted_sheet_is_pressed_and_turned_on_its_surface(page: Page) -> Non
     wait_until(lambda: page.js(SEEN, -40, -30)[0] < left - 2)
     page.skin.status = page.skin.status | {"description": DESCRIPTION}
     wait_until(lambda: not page["surface"].is_displayed())
+
+
+def test_each_node_is_the_middle_of_its_pixel(page: Page) -> None:
+    page.open()
+    page["smooth"].click()
+    for ix, iy in ((47, 5), (3, 45)):
+        image = np.zeros((51, 51), np.float32)
+        image[iy, ix] = 300
+        page.skin.frame = {"pressure_kpa": image}
+        x, y = NODES_MM[ix], NODES_MM[iy]
+        # A smoothed pixel fades towards its corners: they are bright once the click is drawn.
+        for corner in itertools.product((x - 1.2, x + 1.2), (y - 1.2, y + 1.2)):
+            wait_until(partial(is_bright, page, *corner))
+        for dx, dy in ((1.8, 0), (-1.8, 0), (0, 1.8), (0, -1.8)):
+            assert sum(page.colour(x + dx, y + dy)) < 60, (dx, dy)
 
 
 def is_bright(page: Page, x_mm: float, y_mm: float) -> bool:
@@ -868,6 +884,11 @@ def test_a_replay_is_steered_by_the_page(page: Page) -> None:
     page.skin.sends_frames = True  # of where it stands now
     wait_until(lambda: page.health == "replay-paused")
     page.skin.sends_frames = False
+    page.daemon.answers["replay"] = ControlError("the recording ends there", "", "bad_request")
+    page["position"].send_keys(Keys.HOME)
+    wait_until(lambda: page["message"].text == "the recording ends there")
+    wait_until(lambda: page.health == "replay-paused")  # no frame will come
+    page.daemon.answers["replay"] = REPLAY
     page["play"].click()
     page.skin.status |= {"state": "ended"}
     wait_until(lambda: page["play"].text == "Play" and page["state"].text == "replay ended")
@@ -878,10 +899,27 @@ def test_a_replay_is_steered_by_the_page(page: Page) -> None:
         {"loop": True},
         {"speed": 0.25},
         {"position_s": 40.0},
+        {"position_s": 0},
         {"paused": False},
         {"position_s": 0, "paused": False},
     ]
     wait_until(lambda: page.daemon.requests == [("replay", each) for each in asked])
+
+
+def test_a_move_is_over_where_its_frame_comes_before_its_reply(page: Page) -> None:
+    """They come by different sockets; a paused replay sends no second frame."""
+    page.open()
+    is_moving = page.browser.execute_async_script("""
+        const done = arguments[0];
+        import('/replay.js').then(async ({ Replay }) => {
+          const replay = new Replay(async () => { replay.noteFrame(); return true; });
+          replay.fields = { paused: true };
+          document.getElementById('position').dispatchEvent(new Event('input'));
+          const isBegun = replay.isMoving;
+          await new Promise((soon) => setTimeout(soon));
+          done([isBegun, replay.isMoving]);
+        })""")
+    assert is_moving == [True, False]
 
 
 def test_a_replay_that_waits_for_the_page_begins_when_its_first_frame_is_seen(page: Page) -> None:
@@ -1027,6 +1065,24 @@ def test_a_viewer_that_hangs_is_noticed(page: Page) -> None:
     finally:
         goes_on.set()
     wait_until(lambda: page.health == "good")
+
+
+@pytest.mark.slow
+def test_a_daemon_that_never_came_is_waited_for(page: Page) -> None:
+    page.skin.__exit__()
+    page.stop_viewer()  # it may have heard of the daemon by now
+    page.serve()
+    page.browser.get(f"http://127.0.0.1:{page.port}/")
+    wait_until(lambda: page.health == "starting")  # is no alarm yet
+    assert page["banner"].get_attribute("data-level") == "info"
+    assert page["state"].text == "connecting"
+    page.js("tactomo.state.openedAt -= 60000")
+    wait_until(lambda: page.health == "no-daemon")
+    assert page["banner"].find_element(By.TAG_NAME, "code").text == "tactomo daemon"
+    assert f"“left” at {page.skin.address}" in page.banner
+    assert page["no-contacts"].text == "Not known."
+    with Skin(page.skin.address):
+        wait_until(lambda: page.health == "good")
 
 
 # For everybody

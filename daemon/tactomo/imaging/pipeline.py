@@ -111,7 +111,7 @@ class Pipeline(Worker):
         self._ready: deque[DualScan] = deque()  # to be made into frames now
         self._skipped = 0  # dual scans left out because newer ones had come
         self._dropped_seen = 0
-        self._is_excused = False  # the dual scans to be dropped next are not worth a warning
+        self._prepared_for: int | None = None  # when the reference of the frames was taken
         self._announced: dict[int, Hello] = {}  # what each port's device says of itself
         self._begun: set[Channel] = set()  # channels that have been in a dual scan
         self._replay_clock = None if replay is None else ReplayClock(ports, replay.is_paced)
@@ -221,10 +221,7 @@ class Pipeline(Worker):
             self._ready.extend(ready if self._takes_all else self._newest(ready))
             while self._ready and not self._stopping.is_set() and self._is_let_through():
                 self.turns += 1
-                taken_ns = self._imaging.taken_ns
                 self._process(self._ready.popleft())
-                if self._imaging.taken_ns != taken_ns:
-                    self._is_excused = True
                 self._obey_commands()
             self._obey_commands()
             self._imaging.taring.check()
@@ -364,8 +361,10 @@ class Pipeline(Worker):
         self._skipped += max(0, len(ready) - 1)
         self._in_hand -= left_out
         self._left_out += left_out
-        if ready and self._is_excused:  # a new reference takes a while to prepare for
-            self._is_excused, self._dropped_seen = False, self.dropped
+        taken_ns = self._imaging.taken_ns
+        if taken_ns != self._prepared_for:  # a new reference takes a while to prepare for
+            self._dropped_seen = self.dropped
+            self._prepared_for = taken_ns if ready else self._prepared_for
         if self.dropped > self._dropped_seen:
             self._on_event(
                 "scans_dropped",

@@ -127,6 +127,23 @@ def test_whatever_is_pressed_equals_a_solve_of_the_whole_system(
     assert np.abs(off / uneven.bare_voltages).max() < 1e-7
 
 
+def test_a_larger_sheet_leaves_as_much_to_be_solved(small: SensorDescription) -> None:
+    """The same contact and nodes' distance: the same unknowns, on three times the area."""
+    large = variant(
+        small,
+        sheet={"width_m": 0.1, "height_m": 0.09, "frame_width_m": 0.019},
+        electrodes={"pitch_m": 0.03},
+    )
+    unknowns = []
+    for sensor in (small, large):
+        model = ForwardModel(sensor, solve_bare_sheet(sensor, mesh_sheet(sensor, 0.0025, 1)))
+        x, y = model.bare.points[:, model.bare.pressable]
+        solution = model.solve(np.where(np.hypot(x, y) < 0.0101, 99.0, 0.0))
+        unknowns.append((len(solution.rim), len(solution.nodes)))
+    assert unknowns[0] == unknowns[1]
+    assert unknowns[0][0] < 0.5 * unknowns[0][1]
+
+
 def test_what_has_no_conductivity_left_has_no_solution(model: ForwardModel) -> None:
     with pytest.raises(np.linalg.LinAlgError, match="conductivity"):
         model.solve(np.where(bump(model, 2.0) > 0, -2.0, 0.0))

@@ -67,14 +67,15 @@ export class Replay {
     this.moves = position_s;
     this.isMoving = true;
     if (isUnderWay) return;
+    let isObeyed = false;
     for (let asked = null; asked !== this.moves;) {
       asked = this.moves;
       this.hasFrame = false;
-      await this.#ask({ position_s: asked });
+      isObeyed = await this.#ask({ position_s: asked });
     }
     this.moves = null;
     // The frame may come before the reply, and a paused replay sends no other one.
-    if (this.hasFrame && this.fields.paused) this.isMoving = false;
+    if (!isObeyed || (this.hasFrame && this.fields.paused)) this.isMoving = false;
   }
 
   get #hasEnded() {
