@@ -68,7 +68,9 @@ class Auto(Fit):
         found_none = course.belief.done and not len(own.areas or ())
         if not self._has_network or found_none:
             return own
-        if own.misfit <= UNSURE_MISFIT and Flag.MISFIT_HIGH not in own.flags:
+        # What a small budget left unfinished has no claim until it explains the data.
+        is_told = course.belief.done or course.belief.is_explained
+        if is_told and own.misfit <= UNSURE_MISFIT and Flag.MISFIT_HIGH not in own.flags:
             return own
         # It has learnt scenes that no few contacts describe; but where data are left unexplained,
         # sheets may contradict each other, and no network is sure enough to hide that.
