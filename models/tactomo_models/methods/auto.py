@@ -68,8 +68,10 @@ class Auto(Fit):
         found_none = course.belief.done and not len(own.areas or ())
         if not self._has_network or found_none:
             return own
-        # What a small budget left unfinished has no claim until it explains the data.
-        is_told = course.belief.done or course.belief.is_explained
+        # What a small budget left unfinished has no claim before it explains the data, and each
+        # contact was asked what it is.
+        belief = course.belief
+        is_told = belief.done or (belief.is_explained and all(belief.rivals))
         if is_told and own.misfit <= UNSURE_MISFIT and Flag.MISFIT_HIGH not in own.flags:
             return own
         # It has learnt scenes that no few contacts describe; but where data are left unexplained,
