@@ -177,8 +177,9 @@ class Reconstructor:
         self._prepared(self._name)
 
     def reset(self) -> None:
-        """Forget the warm start and which contacts were which."""
+        """Forget the warm start, earlier scans, and which contacts were which."""
         self._tracker.clear()
+        self._repeats.forget()
         self.forget_shape()
 
     def forget_shape(self) -> None:

@@ -22,6 +22,10 @@ class FrozenConverters:
         self._on_event = on_event
         self._repeats = Repeats(pairs)
 
+    def forget(self) -> None:
+        """Take the next dual scan for the first one."""
+        self._repeats.forget()
+
     def without(self, volts: Volts, reference: Reference | None) -> Volts:
         """What was measured of a dual scan; told when that changes for a channel.
 

@@ -232,6 +232,7 @@ class Imaging:
     def forget(self) -> None:
         """Take the next dual scan for the first one: it does not follow on those before."""
         self._reconstructor.reset()
+        self._frozen.forget()
         self._has_moved = True
         self._publisher.tell_status()
 

@@ -205,7 +205,8 @@ class _Inlet:
                 return  # of a daemon that has gone, the bridge still has the last status
             if (other := self._robots.setdefault(sensor, robot)) != robot:
                 if self._name_limit.allows():
-                    detail = f"{robot} and {other} both have a skin {sensor!r}"
+                    one, two = sorted((robot, other))
+                    detail = f"{one} and {two} both have a skin {sensor!r}"
                     next_step = f"--robot {robot} serves the one that is left out"
                     tell("same_sensor_twice", "warning", detail, next_step)
                 return

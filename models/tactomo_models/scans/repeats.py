@@ -47,6 +47,10 @@ class Repeats:
         self._sizes = self._parts.sum(axis=1)
         self._earlier: dict[Channel, deque[FloatArray]] = {}
 
+    def forget(self) -> None:
+        """Take the next scans for the first ones: they may be the same again, as of a replay."""
+        self._earlier.clear()
+
     def find(
         self, channel: Channel, scan: FloatArray, reference: Reference | None
     ) -> Repeated | None:

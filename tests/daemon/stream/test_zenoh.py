@@ -376,7 +376,7 @@ def test_two_robots_skins_of_one_name_are_not_mixed(
 
         samples.until(lambda: len(samples.all) > 5, send)
         warning = running.said("same_sensor_twice")
-        assert warning["detail"] == "leg and arm both have a skin 'left'"
+        assert warning["detail"] == "arm and leg both have a skin 'left'"
         assert "--robot leg" in warning["next_step"]
         while one.poll(0):
             assert decode_message(one.recv()).fields["session"] == first
