@@ -46,7 +46,7 @@ BEGUN_S = pytest.StashKey[float]()
 # refused for what was there before it. For that look with `make test-random`.
 PATIENT: dict[str, Any] = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
 settings.register_profile("few", max_examples=20, derandomize=True, **PATIENT)
-settings.register_profile("many", max_examples=50, derandomize=True, **PATIENT)  # `make test-all`
+settings.register_profile("many", max_examples=100, derandomize=True, **PATIENT)  # `make test-all`
 settings.register_profile("new", max_examples=100, **PATIENT)
 settings.load_profile("few")
 

@@ -80,6 +80,19 @@ def test_any_array_round_trips(array: np.ndarray[Any, Any]) -> None:
     assert not back.flags.writeable
 
 
+def test_big_endian_and_strided_arrays_keep_their_values() -> None:
+    array = np.arange(12, dtype=">f4").reshape(3, 4)[:, ::2]
+    np.testing.assert_array_equal(array_from_wire(array_to_wire(array)), array)
+    assert array_to_wire(array)["dtype"] == "<f4"
+
+
+def test_numpy_values_may_stand_anywhere() -> None:
+    fields = HEADER | {"map": np.ones((2, 3), np.float32), "scan_counter": np.uint32(5)}
+    decoded = decode_message(encode_message("left", "map", fields)).fields
+    assert decoded["scan_counter"] == 5
+    np.testing.assert_array_equal(array_from_wire(decoded["map"]), np.ones((2, 3)))
+
+
 @given(
     shape=values | st.lists(st.integers(-1, 2**63), max_size=6),
     dtype=values | st.sampled_from([*ARRAY_DTYPES, ">f4", "O", "|V8", "f4,f4", "<M8[s]"]),

@@ -113,6 +113,25 @@ def test_a_frame_arrives_typed_and_cannot_be_changed(sensor: FakeSensor) -> None
         frame.sequence = 2  # type: ignore[misc]
 
 
+def test_contacts_alone_need_no_images(sensor: FakeSensor) -> None:
+    unknown = dataclasses.replace(CONTACT, magnitude=None, magnitude_sigma=None, pressure_kpa=None)
+    with subscribe("left", address=sensor.address, kind="contacts", timeout_s=10) as frames:
+        assert sensor.wait_for_subscriber() == b"left/contacts\0"
+        sensor.publish([unknown])
+        frame = next(frames)
+    assert frame.map is None
+    assert frame.contacts == (unknown,)
+
+
+def test_one_sensor_does_not_hear_another() -> None:
+    with FakeSensor("left2") as other, subscribe("left", address=other.address) as frames:
+        other.wait_for_subscriber()
+        other.publish([CONTACT])
+        other.sensor = "left"
+        other.publish()
+        assert next(frames).contacts == ()
+
+
 def test_every_frame_comes_in_order_and_gaps_are_counted(sensor: FakeSensor) -> None:
     with subscribe("left", address=sensor.address, timeout_s=10) as frames:
         sensor.wait_for_subscriber()

@@ -60,6 +60,22 @@ def test_scans_differ_in_any_field(changes: dict[str, Any]) -> None:
     assert len({SCAN, replace(SCAN, samples=SCAN.samples.copy()), replace(SCAN, **changes)}) == 2
 
 
+def test_scans_with_nan_are_equal_bit_by_bit() -> None:
+    quiet, other = (
+        np.array([bits], np.uint32).view(np.float32) for bits in (0x7FC00000, ~0 % 2**32)
+    )
+    assert replace(SCAN, samples=quiet) == replace(SCAN, samples=quiet.copy())
+    assert replace(SCAN, samples=quiet) != replace(SCAN, samples=other)
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.int32, np.float32])
+def test_volts(dtype: type[np.number[Any]]) -> None:
+    samples: Any = np.array([-32768, 0, 32767], dtype=dtype)
+    volts = replace(SCAN, samples=samples).volts(1e-3)
+    assert volts.dtype == np.float64
+    np.testing.assert_allclose(volts, [-32.768, 0.0, 32.767], rtol=1e-12)
+
+
 def test_decoded_scan_keeps_its_type_and_cannot_be_overwritten() -> None:
     [scan] = Decoder().feed(encode(SCAN))
     assert isinstance(scan, Scan)
@@ -176,6 +192,15 @@ def test_the_rule_that_an_intact_frame_breaks_is_named(name: str, told: list[str
     assert Decoder().fault == ""
 
 
+def test_damage_breaks_no_rule() -> None:
+    decoder = Decoder()
+    frame = bytearray(encode(SCAN))
+    frame[9] ^= 1
+    decoder.feed(frame)
+    assert decoder.counts.crc_errors == 1
+    assert decoder.fault == ""
+
+
 def test_the_largest_packet_fits_the_stated_frame_size() -> None:
     largest = UnknownPacket(9, b"\xff" * 4114)
     assert len(encode(largest)) == MAX_FRAME_BYTES
@@ -196,6 +221,14 @@ def test_memory_stays_bounded_whatever_is_fed(filler: bytes) -> None:
         tracemalloc.stop()
     assert peak < 6 * MAX_FRAME_BYTES
     assert decoder.feed(encode(SCAN)) == [SCAN]
+
+
+def test_unending_bytes_without_a_delimiter_are_one_error_at_once() -> None:
+    decoder = Decoder()
+    decoder.feed(b"\0" + b"\x01" * MAX_FRAME_BYTES)
+    assert decoder.counts.oversize == 1, "known before the next delimiter comes"
+    decoder.feed(b"\x01" * 3 * MAX_FRAME_BYTES)
+    assert decoder.counts.oversize == 1
 
 
 def test_corrupt_sums_every_kind_of_error_and_nothing_else() -> None:

@@ -38,6 +38,14 @@ def test_a_path_is_followed_in_straight_lines_and_ends_at_its_last_point() -> No
     ]
 
 
+def test_a_ramp_rises_from_zero_and_falls_to_zero() -> None:
+    ramped = scene(ramp_s=1.0, pressure_kpa=100.0)
+    assert ramped.presses_at(1.0) == {}
+    assert ramped.presses_at(1.25)["scene-0"].pressure_kpa == pytest.approx(25.0)
+    assert ramped.presses_at(3.0)["scene-0"].pressure_kpa == pytest.approx(100.0)
+    assert ramped.presses_at(4.75)["scene-0"].pressure_kpa == pytest.approx(25.0)
+
+
 def test_a_loop_starts_over_after_its_duration() -> None:
     once = scene()
     looped = once.model_copy(update={"loop": True, "duration_s": 10.0})
@@ -76,3 +84,8 @@ def test_a_wrong_scene_is_refused_with_what_is_wrong(tmp_path: Path, text: str, 
         load_scene(path)
     assert says in str(caught.value)
     assert str(path) in str(caught.value)
+
+
+def test_a_missing_scene_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"No such file.* grasp, "):
+        load_scene(tmp_path / "none.toml")

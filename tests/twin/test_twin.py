@@ -188,6 +188,19 @@ def test_a_program_that_knows_nothing_of_terminals_reads_the_bytes_as_they_are(
     assert decoder.counts.corrupt == 0
 
 
+def test_a_scan_in_time_is_not_late(bench: Start) -> None:
+    started = bench(rate_hz=2.0)
+    host = started.host()
+    host.start()
+
+    def late() -> list[bool]:
+        return [bool(scan.flags & ScanFlag.LATE) for scan in host.scans()]
+
+    host.wait_for(lambda: late().count(False) >= 4)  # a computer that stops is late indeed
+    said = started.ask("status")["late_scans"]
+    host.wait_for(lambda: late().count(True) >= said)
+
+
 class WaitingSkin:
     """Its solves after the unloaded one last until `go` is set."""
 
@@ -259,6 +272,25 @@ def test_a_script_starts_with_the_first_scan_that_a_host_receives(bench: Start) 
     assert after_us[end - 1] < 2_000_000 <= after_us[end] + 2
 
 
+def test_play_starts_a_scene_that_is_given_live(bench: Start) -> None:
+    started = bench()
+    with pytest.raises(ControlError, match="no scripted scene"):
+        started.ask("play")
+    press = {"id": "p", "at_s": 0, "duration_s": 3600, "x_mm": 1, "y_mm": 2}
+    assert started.ask("play", scene={"press": [press]}) == {"length_s": 3600.0}
+    assert [p["id"] for p in started.ask("scene")["presses"]] == ["p"]
+
+
+def test_equal_seeds_give_equal_scans(bench: Start) -> None:
+    def first_scans(seed: int) -> list[bytes]:
+        host = bench(seed=seed, noise_v=1e-4).host()
+        host.start()
+        host.wait_for(lambda: len(host.scans()) >= 6)
+        return [scan.samples.tobytes() for scan in host.scans()[:6]]
+
+    assert first_scans(1) == first_scans(1) != first_scans(2)
+
+
 def test_noise_can_be_changed_while_it_runs(bench: Start) -> None:
     started = bench()
     host = started.host()
@@ -288,6 +320,11 @@ def test_the_skin_drifts_as_it_is_told_live_and_by_a_scene(bench: Start, tmp_pat
     host.wait_for(lambda: np.array_equal(host.scans()[-1].samples, rest))
     with pytest.raises(ControlError, match="swing_k"):
         started.ask("drift", swing_k=-1.0)
+
+
+def test_a_skin_that_is_not_simulated_does_not_drift(bench: Start) -> None:
+    with pytest.raises(ControlError, match="not simulated"):
+        bench().ask("drift", swing_k=10.0)
 
 
 def test_nobody_gets_old_scans_and_nobody_blocks_the_twin(bench: Start) -> None:
@@ -440,3 +477,8 @@ def test_more_voltages_than_a_scan_can_have_are_told_at_the_start(
     raw["electrodes"] |= {"count": 64, "length_m": 0.004}
     with pytest.raises(ConfigError, match=r"3904 voltages.*at most 1024; list fewer"):
         begin(SensorDescription.model_validate(raw))
+
+
+def test_a_sensor_of_one_channel_has_no_two_ports() -> None:
+    with pytest.raises(ConfigError, match="1 channel"):
+        TwinConfig(load_description("tank_disc"), ports=2)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from shared_data import measured
 from tactomo.recordings.recording_writer import write_recording
 from tactomo_client import request
 from tactomo_models import SensorDescription, load_description, load_or_build_artifact
@@ -19,7 +20,7 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.bare_sheet import scan_voltages
 from tactomo_models.sensor.description_file import shipped_text
 from tactomo_models.sensor.named_pattern import NamedPattern
-from tactomo_models.sensor.pattern import reciprocal_pairs
+from tactomo_models.sensor.pattern import reciprocal_pairs, scan_pairs
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
 from waiting import PATIENCE_S, wait_until
 from whole_system import SENSOR, Demo, running_demo
@@ -95,6 +96,29 @@ def test_a_table_names_the_electrode(
     assert steps
     assert all(f" {step}\n" in outcome.stdout for step in steps)  # whole: to be copied
     assert "ill: follow the next steps" in outcome.stdout
+
+
+def every_pair(electrodes: int, volts: FloatArray) -> FloatArray:
+    """Scans of adjacent pairs as every drive by every measuring pair, zero where it cannot be."""
+    pairs = scan_pairs(electrodes)
+    full = np.zeros((len(volts), electrodes, electrodes))
+    full[:, pairs.drive[:, 0], pairs.measure[:, 0]] = volts
+    return full.reshape(len(volts), -1)
+
+
+def test_an_unknown_device_is_read_by_its_zeros(tactomo: Run, rest: FloatArray) -> None:
+    np.savez("in.npz", baseline=every_pair(16, np.abs(noisy(rest))), dv=np.zeros((3, 256)))
+    outcome = tactomo("doctor", "in.npz", "--json")
+    assert outcome.returncode == 0, outcome.stdout
+    assert "read as 16:adjacent" in " ".join(report(outcome)["notes"])
+
+
+def test_voltages_in_no_order_are_a_broken_device(tactomo: Run, rest: FloatArray) -> None:
+    mixed = np.random.default_rng(0).permutation(rest)
+    np.savez("in.npz", mine=noisy(mixed))
+    outcome = tactomo("doctor", "in.npz", "--array", "mine")
+    assert outcome.returncode == 1
+    assert "broken: no reading" in outcome.stdout
 
 
 def test_a_pattern_says_the_order(tactomo: Run, rest: FloatArray) -> None:
@@ -238,6 +262,20 @@ def test_nobody_there(tactomo: Run) -> None:
     outcome = tactomo("doctor", "--address", "ipc:///nowhere/at/all", "--seconds", "1")
     assert outcome.returncode == 1
     assert "no daemon answers at ipc:///nowhere/at/all" in outcome.stderr
+
+
+def test_the_broken_device_is_called_broken(tactomo: Run) -> None:
+    outcome = tactomo("doctor", measured("skin_bad_device_32el.npz"))
+    assert outcome.returncode == 1
+    assert "broken" in outcome.stdout
+    assert "67.8%" in outcome.stdout
+
+
+@pytest.mark.parametrize("arguments", [[], ["-d", "tank_disc"], ["--frames", "0:20"]])
+def test_the_tank_is_not(tactomo: Run, arguments: list[str]) -> None:
+    outcome = tactomo("doctor", measured("tank_sciospec_20fps.npz"), *arguments, "--json")
+    assert outcome.returncode == 0
+    assert report(outcome)["verdict"] == "healthy"
 
 
 @pytest.fixture(scope="module")

@@ -47,10 +47,6 @@ def corpus(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     return make
 
 
-SOME: Final = CASES[::4]
-"""Each file by some commands; `make faults` has each read by all."""
-
-
 @pytest.mark.parametrize(
     ("name", "command"),
     [
@@ -61,7 +57,6 @@ SOME: Final = CASES[::4]
             marks=() if name in QUICK.get(command, ()) else (pytest.mark.slow,),
         )
         for name, command in CASES
-        if name in QUICK.get(command, ()) or (name, command) in SOME
     ],
 )
 def test_a_hostile_file_costs_little_and_ends_nothing(

@@ -161,9 +161,8 @@ def test_a_sign_of_their_own(tactomo: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("ending", "columns"), [(".csv", False), (".txt", True), (".tsv", False), (".dat", True)]
-)
+@pytest.mark.parametrize("ending", [".csv", ".txt", ".tsv", ".dat"])
+@pytest.mark.parametrize("columns", [False, True])
 def test_text(tactomo: Run, tmp_path: Path, ending: str, columns: bool) -> None:
     rows = np.vstack(tank())
     delimiter = {".csv": ", ", ".txt": " ", ".tsv": "\t", ".dat": ";"}[ending]
@@ -184,7 +183,7 @@ def test_a_decimal_comma_and_times(tactomo: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pattern", ["32:adjacent", "16:adjacent:rotated"])
+@pytest.mark.parametrize("pattern", ["32:adjacent", "16:opposite:adjacent", "16:adjacent:rotated"])
 def test_another_pattern_is_proposed_and_then_read(
     tactomo: Run, tmp_path: Path, pattern: str
 ) -> None:

@@ -118,6 +118,19 @@ def test_the_rate_and_the_offset_are_told() -> None:
     assert percentiles["p50"] == pytest.approx(2 * math.log(2), rel=0.4)
 
 
+@pytest.mark.parametrize("length_s", [2.0, 60.0])
+def test_what_a_stall_held_up_is_as_old_as_it_is(length_s: float) -> None:
+    seen = arrivals(400, stall_s=(200.0, 200.0 + length_s), device_s=warming_up)
+    assert seen.clock.jumps == 0
+    assert seen.within_ms(1.0) < 1.0
+
+
+def test_a_stall_while_the_clock_is_not_known_yet_does_no_harm() -> None:
+    seen = arrivals(60, stall_s=(4.0, 6.0))
+    assert seen.within_ms(1.0) < 1.0
+    assert max(np.abs(seen.errors_ms)) < 3.0
+
+
 def test_a_backlog_that_stays_is_not_taken_for_the_least_delay() -> None:
     """Half a second of data waits in the device for ten minutes: longer than the fit looks back."""
 
@@ -159,6 +172,19 @@ def test_a_clock_that_jumps_is_known_again_soon(jump: Callable[[int], int], rest
     assert seen.within_ms(1.0) < 1.0
 
 
+def test_a_clock_that_paused_is_known_again() -> None:
+    """It stood still for five seconds, as in a debugger; meanwhile no scan came."""
+    seen = Seen(DeviceClock())
+    rng = random.Random(1)
+    for number in range(8000):
+        at_s = number / 20
+        came_s = at_s + rng.expovariate(1 / 2e-3) + (5.0 if at_s > 200 else 0.0)
+        late_ns = seen.clock.date(MAGNITUDE, round(at_s * 1e6), BOOT_NS + round(came_s * 1e9))
+    assert seen.clock.jumps == 1
+    assert late_ns is not None
+    assert late_ns < 30e6
+
+
 @pytest.mark.parametrize(
     "device_us",
     [
@@ -177,6 +203,13 @@ def test_a_clock_that_is_none_is_found_out(device_us: Callable[[int], int]) -> N
     # One that is only slightly off is believed for two minutes; it is wrong by little then.
     assert max(np.abs(seen.errors_ms), default=0.0) < 10.0
     assert not [at_s for at_s in seen.times_s if at_s > 130]
+
+
+def test_a_clock_that_stops_is_found_out_within_seconds() -> None:
+    seen = arrivals(400, device_us=lambda us: min(us, 200_000_000))
+    assert seen.clock.state is ClockState.UNUSABLE
+    assert max(seen.times_s) < 212
+    assert max(seen.errors_ms) < 1.0  # meanwhile older than it is, never younger
 
 
 def test_a_year_of_microseconds_is_as_good_as_a_minute() -> None:

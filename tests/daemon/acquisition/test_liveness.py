@@ -16,6 +16,11 @@ def device() -> Liveness:
     return liveness
 
 
+def test_a_device_gets_its_time_to_answer(device: Liveness) -> None:
+    assert device.judge(100.0 + PATIENCE_S - 0.1) is DeviceState.STARTING
+    assert device.judge(100.0 + PATIENCE_S) is DeviceState.SILENT
+
+
 @pytest.mark.parametrize(
     ("packets", "scans", "state"),
     [
@@ -31,6 +36,14 @@ def test_what_comes_says_how_it_does(
         device.heard(100.0 + tenth / 10, packets, scans)
     assert device.judge(106.0) is state
     assert device.judge(110.0) is DeviceState.SILENT
+
+
+def test_a_trouble_lasts_until_scans_come(device: Liveness) -> None:
+    device.judge(103.0)
+    device.reopened(106.0)
+    assert device.judge(106.1) is DeviceState.SILENT
+    device.heard(106.2, 1, 1)
+    assert device.judge(106.3) is DeviceState.RUNNING
 
 
 def reopenings(device: Liveness, until_s: int) -> list[int]:
@@ -60,6 +73,14 @@ def test_a_device_that_speaks_is_left_alone_and_soon_looked_after_again(device: 
         assert not device.is_reopening_due(now_s)
     device.judge(339 + REOPEN_S)
     assert device.is_reopening_due(339 + REOPEN_S)
+
+
+def test_a_device_that_is_plugged_in_again_begins_anew(device: Liveness) -> None:
+    reopenings(device, 200)
+    device.opened(300.0)
+    assert device.judge(300.1) is DeviceState.STARTING
+    device.judge(300 + REOPEN_S)
+    assert device.is_reopening_due(300 + REOPEN_S)
 
 
 # Slow by nature
@@ -112,6 +133,14 @@ def test_a_device_of_ours_has_the_rate_that_it_says_and_is_silent_as_soon_as_any
     for second in range(140, 165):
         device.heard(float(second), 1, 0)
     assert device.judge(164.0) is DeviceState.IDLE
+
+
+def test_one_long_pause_is_nobodys_pace(device: Liveness) -> None:
+    for number in range(100):
+        device.heard(101.0 + number / 20, 1, 1)
+    device.heard(4000.0, 1, 1)
+    device.heard(4000.05, 1, 1)
+    assert device.patience_s == PATIENCE_S
 
 
 @pytest.mark.parametrize("since_s", [4.0, 60.0])

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tactomo.imaging.frames import contacts_fields, description_fields, scan_header
+from tactomo.imaging.frames import contacts_fields, description_fields, map_fields, scan_header
 from tactomo.scans import ChannelScan, DualScan, Timing
+from tactomo_client.messages import array_from_wire
 from tactomo_models import Contact, Flag, Reconstruction, load_description
 from tactomo_protocol import Channel, ScanFlag
 from variants import variant
@@ -63,6 +64,13 @@ def test_a_contact_is_in_millimetres_and_kilopascals() -> None:
     assert {name: contact[name] for name in expected} == pytest.approx(expected)
 
 
+def test_all_contacts_together_have_a_force() -> None:
+    fields = contacts_fields(3, frame(force_n=12.5, force_sigma_n=0.5))
+    assert (fields["force_n"], fields["force_sigma_n"]) == (12.5, 0.5)
+    unknown = contacts_fields(3, frame())
+    assert unknown["force_n"] is unknown["force_sigma_n"] is None
+
+
 def test_what_is_not_known_is_nil() -> None:
     contact = Contact(1, 0.0, 0.0, 1e-4, float("nan"), float("inf"), max_kpa=float("inf"))
     [said] = contacts_fields(0, frame(contacts=(contact,)))["contacts"]
@@ -91,6 +99,19 @@ def test_a_status_says_where_the_sheet_lies() -> None:
     x, y, z = np.array(mount["surface_m"]).T
     assert np.hypot(x, y) == pytest.approx(0.05, abs=1e-6)
     assert (z.min(), z.max()) == pytest.approx((0.125, 0.275))
+
+
+def test_a_map_has_its_ends_in_millimetres() -> None:
+    fields = map_fields(0, frame(), SENSOR)
+    assert fields["x_mm"] == pytest.approx([1e3 * SENSOR.map_x_m[0], 1e3 * SENSOR.map_x_m[-1]])
+    assert array_from_wire(fields["map"]).shape == (51, 51)
+    assert fields["structure"] is None
+
+
+def test_the_sensor_is_in_millimetres() -> None:
+    fields = description_fields(SENSOR)
+    assert (fields["width_mm"], fields["sensing_width_mm"]) == pytest.approx((150.0, 138.0))
+    assert np.ptp(np.array(fields["electrodes_mm"])[:, 0]) > 100
 
 
 def test_a_frame_was_acquired_before_its_last_byte_came() -> None:

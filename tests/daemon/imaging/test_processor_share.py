@@ -47,3 +47,19 @@ def test_time_comes_back_when_nothing_has_been_left_out_for_a_while() -> None:
     computer.run(0.4, 2.2, drops=True)
     assert computer.run(1.0, HOLD_S - 1.5, drops=False) == []
     assert computer.run(1.0, 3 * HOLD_S, drops=False) == [1 / 2, 1.0]
+
+
+def test_what_was_too_much_is_tried_less_and_less_often() -> None:
+    computer = Computer()
+    tries = 0
+    for _ in range(120):  # seconds: half of the time is kept, all of it is too much
+        tries += computer.run(0.4, 1.0, drops=computer.share.of_time == 1).count(1.0)
+    assert 3 <= tries <= 6
+
+
+def test_what_was_left_out_while_nothing_pressed_does_not_count() -> None:
+    computer = Computer()
+    computer.run(0.4, 3.0, drops=False)
+    computer.now_s += 60.0
+    computer.dropped += 1000
+    assert computer.run(0.4, 3.0, drops=False) == []

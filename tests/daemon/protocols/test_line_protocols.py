@@ -136,6 +136,12 @@ def test_a_table_comes_in_many_forms(name: str, whole: bool) -> None:
     assert protocol.counts.corrupt == 0
 
 
+def test_what_stands_where_pairs_touch_is_of_no_consequence() -> None:
+    table = table_of(MATRIX, VALUES[:208])
+    table[table == 0] = 2000.0
+    assert scans(begun(Matrix(MATRIX)).feed(teensy_line(table.ravel()))) == [VALUES[:208].tolist()]
+
+
 @pytest.mark.parametrize("beginning", [b"A\n", b"\n", b"A\r\n", b"\r\n"])
 def test_a_line_for_each_drive_after_one_that_begins(beginning: bytes) -> None:
     rows = (table_of(MATRIX, VALUES[:208]) * 16).astype(int)

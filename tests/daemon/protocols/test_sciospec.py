@@ -97,6 +97,15 @@ def test_what_is_lost_or_damaged_costs_its_frame_and_no_other(place: int, junk: 
         assert is_whole or said[place][2] > 1 or hit not in came
 
 
+def test_two_halves_of_two_frames_are_no_frame() -> None:
+    for cut in range(1, 16):
+        port = Sciospec(TANK)
+        mixed = MESSAGES[3][: 4 * cut] + MESSAGES[4][4 * cut :]
+        packets = port.feed(stream([*MESSAGES[:3], mixed, MESSAGES[5]]))
+        assert numbers(packets) == [1, 2, 5]
+        assert (port.counts.damaged, port.counts.faulty) == (1, 0)
+
+
 def test_a_message_that_comes_twice_is_counted_and_does_no_harm() -> None:
     port = Sciospec(TANK)
     first = MESSAGES[2][:1]

@@ -227,6 +227,11 @@ def test_files_copied_without_their_times_are_as_old_as_what_is_in_them(
     assert b.ask("status")["recorder"]["deleted"] == 0
 
 
+def test_a_file_that_says_that_it_lasted_for_years_is_at_most_a_day_long() -> None:
+    claims = [kept(n, n * DAY_S, 5000 * DAY_S) for n in range(3)]
+    assert gone([*claims, kept(3, 5000 * DAY_S, 5000 * DAY_S)]) == []
+
+
 def test_the_file_being_written_stays() -> None:
     assert gone([kept(0, 0, 1, size=10**12)], RecordingConfig(keep_gb=2, keep_days=1)) == []
 

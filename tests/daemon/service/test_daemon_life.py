@@ -111,9 +111,10 @@ def test_a_sensor_of_one_channel_has_one_port() -> None:
     "number",
     [
         signal.SIGTERM,
+        signal.SIGHUP,
         *(
             pytest.param(number, marks=pytest.mark.slow)
-            for number in (signal.SIGINT, signal.SIGHUP)
+            for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGUSR1)
         ),
     ],
 )

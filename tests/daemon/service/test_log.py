@@ -104,6 +104,15 @@ def test_under_journald_a_failure_to_start_is_an_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_elsewhere_it_stays_json(tmp_path: Path) -> None:
+    with daemon("--port", str(tmp_path / "none"), JOURNAL_STREAM="8:1") as process:
+        assert process.stderr is not None
+        said = process.stderr.read()
+    assert '"event": "loading"' in said
+    assert "<3>" not in said
+
+
+@pytest.mark.slow
 def test_its_last_words_say_why(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> None:
     skin = make_skin(tmp_path, 1)
     with daemon("--port", str(skin.lines[0].path)) as process:

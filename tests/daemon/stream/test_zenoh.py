@@ -175,7 +175,7 @@ def test_contacts_of_a_simulated_skin_at_rest_are_sent_by_a_heartbeat(
         start(SimpleNamespace(address=demo.stream), robot="arm")
         wait_until(lambda: samples.all)
         seen, began_s = len(samples.all), time.monotonic()
-        wait_until(lambda: len(samples.all) >= seen + 4)
+        wait_until(lambda: len(samples.all) >= seen + 10)
         came, took_s = len(samples.all) - seen, time.monotonic() - began_s
     assert came <= took_s / HEARTBEAT_S + 2
 
@@ -531,6 +531,7 @@ def test_the_pages_program_prints_touches_and_who_is_there(
     assert said == {"tactomo/arm/left is there", "tactomo/arm/left/contacts 10, 0 mm"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "status", "said"),
     [
@@ -548,11 +549,7 @@ def test_the_pages_program_prints_touches_and_who_is_there(
     ],
 )
 def test_what_cannot_be_done_says_why(
-    tactomo: Callable[..., Any],
-    arguments: list[str],
-    status: int,
-    said: str,
-    configuration: Configure,
+    arguments: list[str], status: int, said: str, configuration: Configure
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as busy:
         endpoint = f"tcp/127.0.0.1:{busy.getsockname()[1]}"
@@ -561,6 +558,10 @@ def test_what_cannot_be_done_says_why(
             "BAD": configuration(mod=3),
             "BUSY": configuration(listen={"endpoints": [endpoint]}),
         }
-        outcome = tactomo("zenoh", *(files.get(word, word) for word in arguments))
-    assert said in " ".join(outcome.stderr.replace("│", " ").split())
+        words = [str(files.get(word, word)) for word in arguments]
+        command = [sys.executable, "-m", "tactomo.cli", "zenoh", *words]
+        outcome = subprocess.run(command, capture_output=True, text=True, check=False)
+    told = " ".join(outcome.stderr.replace("│", " ").split())
+    assert said in told
     assert outcome.returncode == status
+    assert "Traceback" not in told

@@ -55,6 +55,13 @@ def test_the_picture_names_every_method_and_budget() -> None:
     assert figure.get_suptitle() == "a title"
 
 
+def test_the_more_work_a_budget_allows_the_larger_is_its_marker() -> None:
+    points = [point("auto", 0.01, 0.9, budget_s=ms / 1e3) for ms in (20, 1, 5)]
+    (axes,) = draw_chart(points, "a title").axes
+    unhurried, hasty, usual = (bar[0].get_markersize() for bar in axes.containers)
+    assert hasty < usual < unhurried
+
+
 def test_no_two_words_overlap() -> None:
     points = [
         point(method, 0.01 * (1 + step / 20), 0.9 - step / 1000, budget_s=ms / 1e3)
@@ -80,6 +87,16 @@ def test_a_busy_machine_is_told_in_the_picture(
     monkeypatch.setattr(bench_chart, "save_figure", lambda figure, _: drawn.append(figure))
     bench_chart.chart("paper_square", tmp_path / "chart.png", 1, "a machine")
     assert "a machine; the machine was busy" in drawn[0].get_suptitle()  # type: ignore[attr-defined]
+
+
+def test_no_two_methods_look_alike() -> None:
+    figure = draw_chart([point(method, 0.02, 0.9) for method in available_methods()], "a title")
+    (axes,) = figure.axes
+    looks = {(bar[0].get_marker(), bar[0].get_color()) for bar in axes.containers}
+    assert len(looks) == len(available_methods())
+    assert (
+        len({marker for marker, _ in looks}) == len({colour for _, colour in looks}) == len(looks)
+    )
 
 
 def test_what_cannot_be_written_is_refused_before_the_work(

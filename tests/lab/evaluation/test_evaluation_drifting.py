@@ -23,7 +23,7 @@ def _built(artifact: Artifact, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_an_hour_of_drift_leaves_no_ghost_and_erases_nothing(paper: SensorDescription) -> None:
-    day = draw_day(paper, "tuning", 3, hours=0.5)
+    day = draw_day(paper, "tuning", 3, hours=0.75)
     first, again = (day.case(track=False).frames[-1].scans[Channel.STRUCTURE] for _ in range(2))
     np.testing.assert_array_equal(first, again)
     tracked = summarise_day(list(live(day)), day.hours)

@@ -14,9 +14,12 @@ from tactomo_lab.scenes.measures import (
     MATCH_M,
     ContactScore,
     Score,
+    correlation,
     full_range,
     match,
+    relative_error,
     score_contact,
+    summaries,
     summarise,
 )
 from tactomo_lab.scenes.simulation import TrueContact
@@ -27,11 +30,35 @@ TRUE = TrueContact(0.01, -0.02, 400e-6, 180.0, 0.15, "ellipse")
 FOUND = Contact(7, 0.01, -0.02, 400e-6, 0.15, 0.01, 180.0)
 
 
+def test_a_perfect_image_and_none() -> None:
+    truth = np.random.default_rng(0).random((5, 7))
+    assert correlation(2 * truth + 1, truth) == pytest.approx(1)
+    assert correlation(-truth, truth) == pytest.approx(-1)
+    assert relative_error(truth, truth) == 0
+    for nothing in (None, np.zeros_like(truth)):
+        assert correlation(nothing, truth) == 0
+        assert relative_error(nothing, truth) == 1
+
+
 @given(order=st.permutations(range(5)), known=st.integers(0, 5))
 def test_contacts_are_matched_whatever_their_order(order: list[int], known: int) -> None:
     true = [replace(TRUE, x_m=0.025 * k) for k in range(5)]
     found = [replace(FOUND, x_m=0.025 * k + 0.4 * MATCH_M) for k in order[:known]]
     assert sorted(match(found, true)) == sorted(enumerate(order[:known]))
+
+
+def test_too_far_is_no_match_and_spoils_no_other() -> None:
+    far = replace(FOUND, x_m=TRUE.x_m + 1.1 * MATCH_M)
+    assert match([far], [TRUE]) == []
+    near = replace(FOUND, x_m=TRUE.x_m + 0.9 * MATCH_M)
+    assert match([far, near], [TRUE]) == [(1, 0)]
+
+
+def test_a_false_contact_far_away_does_not_push_the_others() -> None:
+    """Least total distance alone would give the near one to the wrong contact."""
+    true = [TRUE, replace(TRUE, x_m=TRUE.x_m + 0.011)]
+    near, false = (replace(FOUND, x_m=TRUE.x_m + x) for x in (0.010, 0.100))
+    assert match([near, false], true) == [(0, 1)]
 
 
 def test_a_contact_is_scored_in_the_units_it_says(paper: SensorDescription) -> None:
@@ -165,3 +192,15 @@ def test_what_was_never_measured_is_nan(paper: SensorDescription) -> None:
     assert np.isnan([nothing.centre_mm, nothing.magnitude_error, nothing.within_sigma]).all()
     unknown = replace(FOUND, magnitude=float("nan"), magnitude_sigma=float("nan"))
     assert np.isnan(summarise([scene(paper, unknown)]).within_sigma)
+
+
+def test_groups(paper: SensorDescription) -> None:
+    scores = [
+        scene(paper, *[FOUND] * contacts, contrast=contrast, snr_db=snr_db)
+        for contacts, contrast, snr_db in ((2, 10.0, 40.0), (1, 99.0, 6.0), (10, 22.5, 40.0))
+    ]
+    grouped = summaries(scores)
+    assert list(grouped["contacts"]) == ["1", "2", "10"]
+    assert list(grouped["contrast"]) == ["10-22", "22-46", "46-100"]
+    assert grouped["SNR (dB)"]["40"].frames == 2
+    assert all(sum(s.frames for s in rows.values()) == 3 for rows in grouped.values())

@@ -26,7 +26,7 @@ from tactomo_lab.scenes.simulation import (
     with_opposite_magnitude,
 )
 from tactomo_lab.scenes.still_scenes import draw_still, scenes
-from tactomo_models import Press, SensorDescription
+from tactomo_models import DataError, Press, SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.bare_sheet import transfer_resistances
 from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
@@ -64,6 +64,17 @@ def test_a_layout_keeps_its_promises(paper: SensorDescription, contacts: int, nu
     assert all(gap_m(a, b) >= GAP_M for a, b in combinations(layout.frames[0], 2))
 
 
+def test_layouts_are_all_that_was_asked_for(paper: SensorDescription) -> None:
+    drawn = [draw_still(paper, "tuning", contacts, n) for contacts in (1, 3) for n in range(60)]
+    assert {layout.shape for layout in drawn} == {*SHAPES, "mixed"}
+    assert {layout.opposite for layout in drawn} == {True, False}
+    contrasts = [layout.contrast for layout in drawn]
+    assert min(contrasts) < 15
+    assert max(contrasts) > 70
+    reach = max(np.abs(outline_of(press)).max() for layout in drawn for press in layout.frames[0])
+    assert reach > 0.066  # of a sensing area that ends at 0.069
+
+
 def test_no_scene_is_in_both_seed_sets(paper: SensorDescription) -> None:
     of = {
         seed_set: {draw_still(paper, seed_set, contacts, n).frames[0][0].x_m for n in range(50)}
@@ -84,6 +95,14 @@ def test_an_outline_is_where_coverage_ends(press: Press) -> None:
         np.testing.assert_array_equal(press.coverage(x, y, 1e-9), covered)
 
 
+def test_the_gap_of_indenters() -> None:
+    left = Press(-0.02, 0.0, 180.0, 0.01)
+    assert gap_m(left, Press(0.02, 0.0, 180.0, 0.01)) == pytest.approx(0.02, rel=1e-3)
+    assert gap_m(left, Press(-0.015, 0.0, 180.0, 0.01)) == 0
+    around = Press(-0.02, 0.0, 180.0, 0.04, shape="ring")
+    assert gap_m(left, around) == gap_m(around, left) == 0
+
+
 @given(press=presses)
 def test_the_truth_has_the_area_the_place_and_the_magnitude(
     paper: SensorDescription, press: Press
@@ -99,6 +118,13 @@ def test_the_truth_has_the_area_the_place_and_the_magnitude(
     np.testing.assert_allclose(centre, [press.x_m, press.y_m], atol=2e-4)
     assert contact.magnitude == pytest.approx(0.03 + 0.22 * 40 / 60)  # of the table, at 180 kPa
     np.testing.assert_allclose(truth.map, contact.magnitude * truth.pressed)
+
+
+def test_a_light_press_is_pressed_in_part_and_has_no_magnitude(paper: SensorDescription) -> None:
+    light, firm = (truth_of(paper, [Press(0, 0, kpa, 0.012)]) for kpa in (5.0, 150.0))
+    np.testing.assert_allclose(light.pressed, firm.pressed * np.log(2) / np.log(100))
+    assert not light.map.any()
+    assert firm.map.max() == pytest.approx(0.03 + 0.22 / 6)
 
 
 def test_variants_of_a_sensor(paper: SensorDescription, small: SensorDescription) -> None:
@@ -194,3 +220,16 @@ def test_the_same_scene_comes_out_of_the_cache(
     mended = one(paper)
     for scene in (again, mended):
         np.testing.assert_array_equal(scan_of(scene), scan_of(first))
+
+
+def test_what_the_cache_cannot_keep_is_simulated(
+    paper: SensorDescription, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = one(paper)
+    monkeypatch.setenv("CACHE_DIRECTORY", "/proc/nowhere")
+    np.testing.assert_array_equal(scan_of(one(paper)), scan_of(kept))
+
+
+def test_more_contacts_than_there_is_room_for(small: SensorDescription) -> None:
+    with pytest.raises(DataError, match="no room for 30"):
+        draw_still(small, "tuning", 30, 0)

@@ -13,8 +13,10 @@ from tactomo_lab.evaluation.field import (
     middle_press,
     scores_of_row,
 )
+from tactomo_lab.evaluation.moving import NOISE_DB, draw_sequence, mixed_sequence
 from tactomo_lab.evaluation.regimes import make_case
 from tactomo_lab.scenes.case import Case
+from tactomo_lab.scenes.measures import summarise
 from tactomo_models import SensorDescription
 from tactomo_protocol import Channel
 
@@ -37,6 +39,15 @@ def test_a_scene_of_each_row_is_reconstructed_and_scored(
         assert len(score.contacts) == len(scenes[line].frames[0].presses)
         assert -1 <= score.icc <= 1
         assert score.seconds > 0
+
+
+@pytest.mark.slow
+def test_a_moving_scene_is_scored_where_no_scan_is_lost(small: SensorDescription) -> None:
+    sequence = draw_sequence(small, "tuning", 0)
+    (scores,) = scores_of_row(small, "moving", "tikhonov", "tuning", 1).values()
+    frames = list(scores)
+    assert len(frames) == sum(len(frame.scans) == 2 for frame in sequence.frames)
+    assert 0 < summarise(frames).icc < 1
 
 
 def test_ordinary_scenes_are_the_same_ones_at_each_noise(small: SensorDescription) -> None:
@@ -76,6 +87,16 @@ def test_one_graded_sheet_has_no_structure_scan(small: SensorDescription) -> Non
     assert 0.5 * highest < scene.truth.map.max() <= highest
 
 
+def test_a_ball_has_its_peak_and_the_mean_over_its_area(small: SensorDescription) -> None:
+    (scene,) = one_of(small, "soft").values()
+    (press,), (contact,) = scene.plan.frames[0], scene.truth.contacts
+    assert press.profile == "dome"
+    assert contact.pressure_kpa == press.pressure_kpa
+    cell_m2 = np.diff(small.map_x_m)[0] * np.diff(small.map_y_m)[0]
+    in_all = scene.truth.map.sum() * cell_m2
+    assert contact.magnitude * contact.area_m2 == pytest.approx(in_all, rel=1e-6)
+
+
 @pytest.mark.slow
 def test_one_soft_contact_is_drawn_the_middle_one(small: SensorDescription, tmp_path: Path) -> None:
     middle = middle_press(small, "tikhonov", "tuning", 6)
@@ -85,3 +106,12 @@ def test_one_soft_contact_is_drawn_the_middle_one(small: SensorDescription, tmp_
     assert middle.score.icc == single[len(single) // 2]
     draw_press(middle, tmp_path / "press.png")
     assert (tmp_path / "press.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_mixed_moving_presses_are_scored_at_both_noises(small: SensorDescription) -> None:
+    lines = scores_of_row(small, "mixed-moving", "tikhonov", "tuning", 1)
+    assert list(lines) == [f"mixed-moving, noise of {of}" for of in ("each change", "voltage")]
+    for noise_of, scores in zip(NOISE_DB, lines.values(), strict=True):
+        frames = len(mixed_sequence(small, "tuning", 0, noise_of).frames)
+        assert summarise(list(scores)).frames == frames

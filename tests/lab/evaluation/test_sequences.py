@@ -28,7 +28,7 @@ def changing(small: SensorDescription) -> Case:
     return mixed_sequence(small, "tuning", 0, "each change")
 
 
-@pytest.fixture(params=range(4))
+@pytest.fixture(params=range(12))
 def steps(paper: SensorDescription, request: pytest.FixtureRequest) -> list[Step]:
     return mixed_steps(Draw(paper, np.random.default_rng(request.param), request.param))
 
@@ -81,7 +81,7 @@ def test_presses_stay_on_the_sheet_and_apart(steps: list[Step], paper: SensorDes
             assert paper.on_sheet(x, y, paper.sheet.frame_width_m).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_noise_grows_with_each_change_or_stays(changing: Case, small: SensorDescription) -> None:
     steady = mixed_sequence(small, "tuning", 0, "voltage")
     assert [f.presses for f in steady.frames] == [f.presses for f in changing.frames]

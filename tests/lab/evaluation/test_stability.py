@@ -12,8 +12,11 @@ from tactomo_lab.evaluation.play import Played, Player, Variant
 from tactomo_lab.evaluation.regimes import KINDS, REGIMES, draw_plan, make_case
 from tactomo_lab.evaluation.stability import (
     Judged,
+    Trust,
     evaluate_regimes,
     judge,
+    trust,
+    trust_by_regime,
 )
 from tactomo_lab.scenes.case import Case, Plan
 from tactomo_lab.scenes.drawing import BOTH_CHANNELS, gap_m, outline_of
@@ -27,6 +30,7 @@ from tactomo_lab.scenes.simulation import (
 from tactomo_models import Artifact, Reconstructor, SensorDescription, build_artifact
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics import tikhonov as linear
+from tactomo_models.physics.bare_sheet import exchanged
 from tactomo_models.scene.press import Press, Profile, Shape
 from tactomo_protocol import Channel
 
@@ -81,6 +85,42 @@ def test_regimes_are_what_they_are_called(paper: SensorDescription) -> None:
         for plan in plans(paper, regime):
             (a,), (b,) = plan.frames[-2:]
             assert 3 <= 1e3 * np.hypot(b.x_m - a.x_m, b.y_m - a.y_m) <= 10
+
+
+def test_a_palm_comes_from_nothing_to_its_pressure(paper: SensorDescription) -> None:
+    for plan in plans(paper, "palm"):
+        assert len(plan.frames) <= 40
+        assert not plan.frames[0]
+        kpa = [press.pressure_kpa for frame in plan.frames for press in frame]
+        assert kpa == sorted(kpa)
+        assert kpa[0] < 0.1 * kpa[-1]
+        assert 2 <= kpa[-1] == kpa[-2] <= 200
+        (palm,) = plan.frames[-1]
+        assert palm.radius_y_m is not None
+        assert 0.030 <= palm.radius_y_m <= palm.radius_m <= 0.069
+    last = [plan.frames[-1][0] for plan in plans(paper, "palm")]
+    assert {press.shape for press in last} == {"ellipse", "rectangle"}
+    assert {press.profile for press in last} == {"flat", "dome"}
+    assert max(press.radius_m for press in last) > 0.050
+
+
+def test_presses_overload_the_table_with_others_in_range(paper: SensorDescription) -> None:
+    scenes = [plan.frames[0] for plan in plans(paper, "overload")]
+    assert {len(presses) for presses in scenes} == {1, 2, 3}
+    assert all(300 <= presses[0].pressure_kpa <= 600 for presses in scenes)
+    others = [press.pressure_kpa for presses in scenes for press in presses[1:]]
+    assert min(others) <= 200
+    assert max(others) > 300
+
+
+def test_mixed_presses_are_on_skins_made_by_hand(paper: SensorDescription) -> None:
+    for plan in plans(paper, "mixed"):
+        assert (plan.unevenness, plan.impedance_deviation) == (0.10, 0.30)
+        off_mm = 1e3 * np.abs(plan.displaced_m)
+        assert len(off_mm) == 16
+        assert 0.5 < off_mm.max() <= 1
+        assert (plan.snr_db, plan.snr_of) == (60, "voltage")
+        assert (plan.contrast, plan.opposite) == (100, False)  # as described
 
 
 def kind(press: Press) -> tuple[Shape, Profile]:
@@ -156,6 +196,13 @@ def test_states_of_a_sheet(small: SensorDescription) -> None:
     poor = tuple(30.0 if e == 2 else 1.0 for e in range(count))
     loose = even.voltages([], {Channel.STRUCTURE: SheetState(impedance=poor)})
     assert 1e-4 < change(loose[Channel.STRUCTURE], made[Channel.STRUCTURE]) < 0.2
+
+
+def test_exchanging_leads_twice_is_nothing() -> None:
+    rng = np.random.default_rng(0)
+    resistance = np.pad(rng.standard_normal((4, 4)), (0, 1))
+    order = [3, 1, 2, 0, 4]
+    np.testing.assert_allclose(exchanged(exchanged(resistance, order), order), resistance)
 
 
 def test_a_skin_may_be_warped(small: SensorDescription) -> None:
@@ -262,6 +309,28 @@ def test_what_is_right_where_the_magnitude_channel_shows_nothing(small: SensorDe
 
 def one(icc: float, flags: tuple[str, ...] = (), has_map: bool = True) -> Judged:
     return Judged("a", "auto", made_score(icc=icc, icc_structure=icc, flags=flags, has_map=has_map))
+
+
+def test_warnings_are_counted() -> None:
+    lead = ("electrode_fault",)
+    scores = [
+        *(one(0.69), one(0.2, flags=lead), one(0.1, flags=("misfit_high",))),
+        *(one(0.7), one(0.9, flags=lead), one(0.8, has_map=False), one(0.95)),
+    ]
+    counted = trust(scores)
+    assert counted.icc == pytest.approx(4.34 / 7)
+    assert counted == Trust(7, counted.icc, 3, 2, 1, 1, 2)
+    scores += [one(0.3)._replace(regime="b", method="fit")]
+    by_regime = trust_by_regime(scores)
+    assert list(by_regime) == ["a", "b", "all"]
+    assert by_regime["a"]["auto"] == counted
+    assert by_regime["b"]["fit"].bad_unwarned == by_regime["all"]["fit"].bad_unwarned == 1
+
+
+def test_a_regime_may_have_a_sensor_that_a_method_does_not_serve(small: SensorDescription) -> None:
+    methods = ("tikhonov", "network")  # which needs both channels
+    ((score,),) = evaluate_regimes(small, ["graded"], methods, "tuning", 1)
+    assert score.method == "tikhonov"
 
 
 @pytest.mark.long

@@ -27,6 +27,17 @@ def test_scatter_and_hysteresis_are_no_slips(scatter: float, hysteresis: float) 
     assert not any(find_outliers(table(seed, scatter, hysteresis)) for seed in range(20))
 
 
+@pytest.mark.parametrize("factor", [10, 0.1])
+@pytest.mark.parametrize("column", ["pressure_kpa", "magnitude"])
+@pytest.mark.parametrize("index", [5, 6, 9])
+def test_a_wrong_power_of_ten_is_one(column: str, factor: float, index: int) -> None:
+    for seed in range(5):
+        readings = table(seed, 0.03, 0.05)
+        value = getattr(readings[index], column)
+        readings[index] = readings[index].model_copy(update={column: value * factor})
+        assert find_outliers(readings) == [index]
+
+
 def test_two_slips_the_worse_one_first_and_too_few_readings() -> None:
     readings = table(1, 0.02, 0.0)
     readings[4] = readings[4].model_copy(update={"magnitude": 0.0})

@@ -173,8 +173,8 @@ def test_what_creeps_back_after_a_long_press_is_no_ghost(life: Life) -> None:
 @pytest.mark.slow
 def test_a_step_that_no_skin_makes_is_refused_and_said(life: Life) -> None:
     """A fifth less is a drift that the fit allows for, three tenths are not."""
-    assert life.lives(60, gain=0.7, step_s=20.0)[-1].flags
-    life.lives(30, step_s=10.0)
+    assert life.lives(60, gain=0.7)[-1].flags
+    life.lives(30)
     assert life.tracker.state == "refused"
     assert life.tracker.refusal
 
@@ -227,8 +227,15 @@ def test_a_skin_with_a_lead_broken_for_good_is_followed_like_any(broken: Life) -
     assert np.abs(broken.tracker.reference.structure_drift).max() < 0.1  # also of that lead's
 
 
-def test_a_contact_that_lasts_is_never_erased_where_a_lead_is_broken(broken: Life) -> None:
-    frames = broken.lives(6 * 3600, BESIDE_LEAD, step_s=600.0, gain=1.01)
+@pytest.mark.parametrize(
+    "press",
+    [pytest.param(PRESS, marks=pytest.mark.slow), BESIDE_LEAD],
+    ids=["firm", "light, beside it"],
+)
+def test_a_contact_that_lasts_is_never_erased_where_a_lead_is_broken(
+    broken: Life, press: Press
+) -> None:
+    frames = broken.lives(12 * 3600, press, step_s=600.0, gain=1.02)
     assert 0 not in count(frames)
     assert set(count(broken.lives(20))) == {0}
 

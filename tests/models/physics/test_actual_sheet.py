@@ -41,14 +41,27 @@ def off(voltages: FloatArray, forward: ForwardModel) -> float:
     return float(np.std(ratio / np.median(ratio)))
 
 
+@pytest.mark.parametrize("seed", [5, 6])
 def test_a_hand_made_sheet_is_found_by_its_reference(
-    paper: SensorDescription, artifact: Artifact, estimator: SheetEstimator
+    paper: SensorDescription, artifact: Artifact, estimator: SheetEstimator, seed: int
 ) -> None:
-    voltages = 1e4 * hand_made(paper).voltages([])[Channel.MAGNITUDE]  # whatever its unit
+    voltages = hand_made(paper, seed).voltages([])[Channel.MAGNITUDE]
     found = estimator.estimate(voltages, EVERY, NOISE)
     assert found is not None
     assert off(voltages, ForwardModel(paper, artifact.bare)) > 0.05
     assert off(voltages, found) < 0.005
+
+
+@pytest.mark.slow
+def test_the_scale_of_the_voltages_is_of_no_matter(
+    paper: SensorDescription, estimator: SheetEstimator
+) -> None:
+    voltages = hand_made(paper).voltages([])[Channel.MAGNITUDE]
+    one = estimator.estimate(voltages, EVERY, NOISE)
+    two = estimator.estimate(1e4 * voltages, EVERY, NOISE)
+    assert one is not None
+    assert two is not None
+    assert two.bare_voltages == pytest.approx(one.bare_voltages, rel=1e-6)
 
 
 def test_a_press_changes_the_voltages_as_the_found_sheet_foretells(

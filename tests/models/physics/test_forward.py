@@ -59,6 +59,15 @@ def test_the_jacobian_passes_a_taylor_test(model: ForwardModel, contrast: float)
     assert found == pytest.approx(2, abs=0.1)
 
 
+def test_the_jacobian_of_the_bare_sheet_passes_a_taylor_test(model: ForwardModel) -> None:
+    slope = model.bare_jacobian()
+    direction = np.random.default_rng(2).normal(size=slope.shape[1:])
+    found = taylor_orders(
+        lambda at: model.solve(at).voltages, 0 * direction, slope @ direction, direction, STEPS
+    )
+    assert found == pytest.approx(2, abs=0.1)
+
+
 def test_the_derivative_by_parameters_is_the_one_by_nodes_times_theirs(
     paper: SensorDescription, artifact: Artifact
 ) -> None:
@@ -96,6 +105,25 @@ def solve_directly(model: ForwardModel, sheet: SheetMesh, change: FloatArray) ->
     )
 
 
+def test_a_pressed_sheet_equals_a_solve_of_the_whole_system(
+    sheet: SheetMesh, model: ForwardModel
+) -> None:
+    all_over = np.full(len(model.bare.pressable), 4.0)
+    for change in (*(bump(model, contrast) for contrast in (1.2, 100.0, 0.01)), all_over):
+        pressed = model.solve(change).voltages
+        np.testing.assert_allclose(pressed, solve_directly(model, sheet, change), rtol=1e-8)
+        assert np.abs(pressed / model.bare_voltages - 1).max() > 0.01
+
+
+def test_an_uneven_sheet_leaves_no_more_to_be_solved(
+    model: ForwardModel, uneven: ForwardModel
+) -> None:
+    change = bump(model, 2.0)
+    solution = uneven.solve(change)
+    np.testing.assert_array_equal(solution.rim, model.solve(change).rim)
+    assert len(solution.rim) < 0.5 * len(solution.nodes)
+
+
 spots = st.lists(
     st.tuples(
         st.floats(-0.03, 0.03),
@@ -127,6 +155,11 @@ def test_whatever_is_pressed_equals_a_solve_of_the_whole_system(
     assert np.abs(off / uneven.bare_voltages).max() < 1e-7
 
 
+def test_what_has_no_conductivity_left_has_no_solution(model: ForwardModel) -> None:
+    with pytest.raises(np.linalg.LinAlgError, match="conductivity"):
+        model.solve(np.where(bump(model, 2.0) > 0, -2.0, 0.0))
+
+
 def test_a_larger_sheet_leaves_as_much_to_be_solved(small: SensorDescription) -> None:
     """The same contact and nodes' distance: the same unknowns, on three times the area."""
     large = variant(
@@ -142,11 +175,6 @@ def test_a_larger_sheet_leaves_as_much_to_be_solved(small: SensorDescription) ->
         unknowns.append((len(solution.rim), len(solution.nodes)))
     assert unknowns[0] == unknowns[1]
     assert unknowns[0][0] < 0.5 * unknowns[0][1]
-
-
-def test_what_has_no_conductivity_left_has_no_solution(model: ForwardModel) -> None:
-    with pytest.raises(np.linalg.LinAlgError, match="conductivity"):
-        model.solve(np.where(bump(model, 2.0) > 0, -2.0, 0.0))
 
 
 def test_reciprocity_holds_to_rounding(model: ForwardModel, small: SensorDescription) -> None:
@@ -243,6 +271,19 @@ def test_drive_and_measurement_may_change_places(small: SensorDescription, shape
         assert adjacent[measured, driven] == pytest.approx(value, rel=1e-8)
 
 
+def test_driving_the_other_way_round_turns_the_sign(small: SensorDescription) -> None:
+    """With opposite drive each pair is driven twice, once in either direction."""
+    half = small.electrode_count // 2
+    sensor = variant(small, pattern={"drive_offset": half})
+    model = ForwardModel(sensor, solve_bare_sheet(sensor, mesh_sheet(sensor, refinements=1)))
+    change = bump(model, 50.0)
+    solution = model.solve(change)
+    there, back = np.split(solution.voltages, 2)
+    np.testing.assert_allclose(there, -back, rtol=1e-12)
+    J_there, J_back = np.split(model.jacobian(solution, np.flatnonzero(change)), 2)
+    np.testing.assert_allclose(J_there, -J_back, rtol=1e-9, atol=1e-15)
+
+
 def test_a_solve_does_not_depend_on_the_one_before(model: ForwardModel) -> None:
     """What is known of an area serves again while the same triangles change, and then only."""
     changes = [bump(model, 2.0), bump(model, 50.0), bump(model, 2.0) * (bump(model, 2.0) > 0.3)]
@@ -253,10 +294,30 @@ def test_a_solve_does_not_depend_on_the_one_before(model: ForwardModel) -> None:
         np.testing.assert_array_equal(after.potentials, alone.potentials)
 
 
+def test_nothing_pressed_is_the_bare_sheet(model: ForwardModel) -> None:
+    np.testing.assert_array_equal(
+        model.solve(np.zeros(len(model.bare.pressable))).voltages, model.bare_voltages
+    )
+
+
 def test_the_frame_cannot_be_pressed(paper: SensorDescription, artifact: Artifact) -> None:
     x, y = np.abs(artifact.bare.points[:, artifact.bare.pressable])
     edge = paper.width_m / 2 - paper.sheet.frame_width_m
     assert max(x.max(), y.max()) <= edge + 1e-9
+
+
+def test_a_thicker_sheet_gives_smaller_voltages(small: SensorDescription) -> None:
+    """Twice as thick with contacts twice as good: half the volts, in the same proportions."""
+    thick = variant(
+        small,
+        sheet={"thickness_m": 2e-4},
+        electrodes={"contact_impedance_ohm_m": 5.0},
+    )
+    volts = []
+    for sensor in (small, thick):
+        model = ForwardModel(sensor, solve_bare_sheet(sensor, mesh_sheet(sensor, refinements=1)))
+        volts.append(model.bare_voltages * model.volts_per_unit)
+    np.testing.assert_allclose(volts[0], 2 * volts[1], rtol=1e-9)
 
 
 def test_small_electrodes_agree_with_pyeits_point_electrodes(small: SensorDescription) -> None:

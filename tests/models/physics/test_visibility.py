@@ -61,3 +61,11 @@ def test_a_press_that_moves_by_its_uncertainty_is_as_unlike_as_noise_is(
         for dx, dy in ((step_m, 0.0), (0.0, step_m))
     ]
     assert 1.0 < np.linalg.norm(moved) < 6.0
+
+
+def test_it_tells_nothing_where_no_press_fits(seen: Visibility, small: SensorDescription) -> None:
+    known = np.isfinite(seen.signal)
+    assert not known[0].any()
+    assert not known[:, -1].any()
+    assert known[small.map.nodes_y // 2, small.map.nodes_x // 2]
+    assert (known == np.isfinite(seen.place_m)).all()

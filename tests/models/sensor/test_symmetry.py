@@ -33,6 +33,11 @@ def turned(press: Press, symmetry: Symmetry) -> Press:
     )
 
 
+def test_a_square_has_eight_and_an_oblong_sheet_four(tmp_path: object) -> None:
+    assert len(symmetries(sensor(SQUARE, tmp_path))) == 8
+    assert len(symmetries(sensor(SMALL, tmp_path))) == 4
+
+
 def test_the_paper_sensor_keeps_every_voltage_under_all_eight() -> None:
     for symmetry in symmetries(load_description("paper_square")):
         assert sorted(symmetry.scan) == list(range(208))

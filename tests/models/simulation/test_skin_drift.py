@@ -25,6 +25,13 @@ def changes(
     return np.asarray(np.log(now[Channel.STRUCTURE] / bare[Channel.STRUCTURE]))
 
 
+def test_by_itself_a_skin_does_nothing(sheet: SkinSimulator) -> None:
+    skin = DriftingSkin(sheet)
+    for time_s, presses in ((0.0, []), (5.0, PRESS), (3600.0, [])):
+        for name, volts in skin.voltages(presses, time_s).items():
+            np.testing.assert_array_equal(volts, sheet.voltages(presses)[name])
+
+
 def test_a_warmer_sheet_conducts_better_a_little_unevenly(sheet: SkinSimulator) -> None:
     even = DriftingSkin(sheet, SkinDrift(step_k=5.0, uneven=0.0))
     np.testing.assert_allclose(changes(even, sheet, 0.0, []), -0.1, rtol=1e-9)
@@ -54,3 +61,14 @@ def test_contact_impedances_wander(sheet: SkinSimulator) -> None:
     skin = DriftingSkin(sheet, SkinDrift(impedance=0.5))
     assert np.abs(changes(skin, sheet, 0.0, [])).max() < 1e-9
     assert np.isfinite(changes(skin, sheet, 3000.0, [])).all()
+
+
+@pytest.mark.slow
+def test_equal_seeds_drift_alike(sheet: SkinSimulator) -> None:
+    drift = SkinDrift(swing_k=10.0, impedance=0.2)
+    one, same, other = (DriftingSkin(sheet, drift, seed) for seed in (1, 1, 2))
+    for skin in (one, same, other):
+        skin.voltages([], 0.0)
+    seen = [changes(skin, sheet, 9000.0, []) for skin in (one, same, other)]
+    np.testing.assert_array_equal(seen[0], seen[1])
+    assert not np.array_equal(seen[0], seen[2])
