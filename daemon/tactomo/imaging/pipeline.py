@@ -364,7 +364,8 @@ class Pipeline(Worker):
         taken_ns = self._imaging.taken_ns
         if taken_ns != self._prepared_for:  # a new reference takes a while to prepare for
             self._dropped_seen = self.dropped
-            self._prepared_for = taken_ns if ready else self._prepared_for
+            if ready:
+                self._prepared_for = taken_ns
         if self.dropped > self._dropped_seen:
             self._on_event(
                 "scans_dropped",

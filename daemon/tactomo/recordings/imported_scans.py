@@ -194,7 +194,23 @@ def read_scans(
     path = path if isinstance(path, Path) else path[0]
     if array is None and any(name in arrays for name in Channel):
         scans = _batch(path, arrays, description)
-        return _turned_round(_with_companions(path, arrays, scans, description), description)
+    else:
+        scans = _of_channel(path, arrays, description, channel, array, pattern, turn_rad)
+    readings, at_rest = companions_of(path, arrays, description, scans.count)
+    scans = replace(scans, companions=readings, companions_at_rest=at_rest)
+    return _turned_round(scans, description)
+
+
+def _of_channel(
+    path: Path,
+    arrays: dict[str, NDArray[Any]],
+    description: SensorDescription,
+    channel: Channel | None,
+    array: str | None,
+    pattern: NamedPattern | None,
+    turn_rad: float | None,
+) -> Scans:
+    """The scans of a file of one channel; see `read_scans`."""
     rest: NDArray[Any] | None = None
     if array is None and is_single_ended(arrays):
         raw, time_s = _differences(path, arrays, description)
@@ -203,15 +219,7 @@ def read_scans(
     channel = channel or _only_channel(description)
     volts, notes, turned_rad = _in_phase(path, raw, turn_rad)
     reference = {} if rest is None else {channel: _in_phase(path, rest, turned_rad)[0]}
-    scans = Scans({channel: volts}, time_s, reference, notes, turned_rad)
-    return _turned_round(_with_companions(path, arrays, scans, description), description)
-
-
-def _with_companions(
-    path: Path, arrays: dict[str, NDArray[Any]], scans: Scans, description: SensorDescription
-) -> Scans:
-    readings, at_rest = companions_of(path, arrays, description, scans.count)
-    return replace(scans, companions=readings, companions_at_rest=at_rest)
+    return Scans({channel: volts}, time_s, reference, notes, turned_rad)
 
 
 def _turned_round(scans: Scans, description: SensorDescription) -> Scans:

@@ -63,20 +63,22 @@ class Auto(Fit):
 
     def _concluded(self, course: Course, measurement: Measurement) -> Estimate:
         own = super()._concluded(course, measurement)
-        assert course.belief is not None
+        belief = course.belief
+        assert belief is not None
         # Where every contact was tried and none explains anything, no network knows better.
-        found_none = course.belief.done and not len(own.areas or ())
+        found_none = belief.done and not len(own.areas or ())
         if not self._has_network or found_none:
             return own
         # What a small budget left unfinished has no claim before it explains the data, and each
         # contact was asked what it is.
-        belief = course.belief
         is_told = belief.done or (belief.is_explained and all(belief.rivals))
-        if is_told and own.misfit <= UNSURE_MISFIT and Flag.MISFIT_HIGH not in own.flags:
+        fits = own.misfit <= UNSURE_MISFIT and Flag.MISFIT_HIGH not in own.flags
+        if fits and is_told:
             return own
         # It has learnt scenes that no few contacts describe; but where data are left unexplained,
         # sheets may contradict each other, and no network is sure enough to hide that.
-        made = network_estimate(self._skin, measurement, "no pressure field explains the data")
+        why = "the search has not ended" if fits else "no pressure field explains the data"
+        made = network_estimate(self._skin, measurement, why)
         if len(own.areas or ()) and not self._shows_any(made):
             return own  # what is felt is not hidden
         flags, at_rest = made.flags | own.flags, course.at_rest

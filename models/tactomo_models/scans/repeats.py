@@ -9,7 +9,6 @@ firmware sends its buffers round and round.
 
 from __future__ import annotations
 
-from collections import deque
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -45,7 +44,7 @@ class Repeats:
         }
         self._names, self._parts = np.array(list(parts)), np.array(list(parts.values()))
         self._sizes = self._parts.sum(axis=1)
-        self._earlier: dict[Channel, deque[FloatArray]] = {}
+        self._earlier: dict[Channel, FloatArray] = {}  # (n, M) scans of each, the last one last
 
     def forget(self) -> None:
         """Take the next scans for the first ones: they may be the same again, as of a replay."""
@@ -59,9 +58,8 @@ class Repeats:
         Coarse counts repeat by chance: as often as those beside the drives and pairs in question.
         None where nothing can be told: of the first scan, and of those without noise at the tare.
         """
-        scans = self._earlier.setdefault(channel, deque(maxlen=EARLIER))
-        earlier = np.concatenate([np.empty(0), *scans]).reshape(len(scans), len(scan))
-        scans.append(scan)
+        earlier = self._earlier.get(channel, np.empty((0, len(scan))))
+        self._earlier[channel] = np.vstack([earlier[1 - EARLIER :], scan])
         noise: Any = getattr(reference, f"{channel}_noise", None)
         if not len(earlier) or not _is_noisy(reference, noise, scan):
             return None

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Annotated, Self
 
 import numpy as np
-import shapely
 from pydantic import Field, model_validator
 
+from tactomo_models.sensor.outline import uncrossed
 from tactomo_models.sensor.section import Section
 from tactomo_models.sensor.sheet import Ring
 
@@ -37,11 +37,8 @@ class Companion(Section):
     def _tells_a_force(self) -> Self:
         if self.gain_n_per_unit == 0:
             raise ValueError("gain_n_per_unit = 0: give the newtons of one unit of the reading")
-        if self.region_m is not None and not shapely.Polygon(self.region_m).is_valid:
-            raise ValueError(
-                "region_m crosses or touches itself: give its corners in the order in which one "
-                "walks round"
-            )
+        if self.region_m is not None:
+            uncrossed("region_m", self.region_m)
         if self.limits is not None and self.limits[0] >= self.limits[1]:
             raise ValueError(
                 f"limits = {list(self.limits)}: give the least reading, then the largest"

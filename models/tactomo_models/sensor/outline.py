@@ -160,14 +160,13 @@ def polygon_outline(
     return Outline(shapely.orient_polygons(rest))
 
 
-def _simple(key: str, corners: tuple[tuple[float, float], ...]) -> shapely.Polygon:
-    closed = corners[:-1] if len(corners) > 3 and corners[0] == corners[-1] else corners
-    for number, (before, corner) in enumerate(pairwise(closed), start=1):
-        if corner == before:
-            raise ValueError(
-                f"{key}[{number}] is the corner before it once more: give each corner once"
-            )
-    ring = shapely.Polygon(closed)
+def uncrossed(key: str, corners: tuple[tuple[float, float], ...]) -> shapely.Polygon:
+    """The polygon of corners.
+
+    Raises:
+        ValueError: it crosses or touches itself.
+    """
+    ring = shapely.Polygon(corners)
     if not ring.is_valid:
         why = shapely.is_valid_reason(ring)
         at = why[why.find("[") + 1 : -1].replace(" ", ", ") if "[" in why else ""
@@ -175,6 +174,17 @@ def _simple(key: str, corners: tuple[tuple[float, float], ...]) -> shapely.Polyg
             f"{key} crosses or touches itself{f' at {at}' if at else ''}: give its corners in the "
             "order in which one walks round, each once"
         )
+    return ring
+
+
+def _simple(key: str, corners: tuple[tuple[float, float], ...]) -> shapely.Polygon:
+    closed = corners[:-1] if len(corners) > 3 and corners[0] == corners[-1] else corners
+    for number, (before, corner) in enumerate(pairwise(closed), start=1):
+        if corner == before:
+            raise ValueError(
+                f"{key}[{number}] is the corner before it once more: give each corner once"
+            )
+    ring = uncrossed(key, closed)
     if len(closed) < 3 or ring.area < 1e-10:
         raise ValueError(f"{key} encloses no area: give three corners or more, in metres")
     sharp = _sharpest(np.array(closed))

@@ -72,16 +72,19 @@ def copy(
     """Copy a shipped sensor description to a file of your own, to be changed there."""
     from tactomo_models.sensor.description_file import shipped_text
 
+    _write_new(path, shipped_text(name))
+    say(f"wrote {path}; give it to --description")
+
+
+def _write_new(path: Path, text: str) -> None:
     from tactomo.errors import TactomoError, os_errors_as
 
-    text = shipped_text(name)
     step = "give the path of a new file"
     with (
         os_errors_as(TactomoError, f"cannot write {path}", step),
         path.open("x", encoding="utf-8") as file,
     ):
         file.write(text)
-    say(f"wrote {path}; give it to --description")
 
 
 @app.command(
@@ -152,11 +155,7 @@ def import_model(
         )
     name = re.sub(r"\W+", "_", path.stem.lower(), flags=re.ASCII).strip("_0123456789") or "sensor"
     text, sensor = describe(model, source, name, electrode_mm)
-    with (
-        os_errors_as(TactomoError, f"cannot write {path}", "give the path of a new file"),
-        path.open("x", encoding="utf-8") as file,
-    ):
-        file.write(text)
+    _write_new(path, text)
     x_mm, y_mm = 1e3 * sensor.electrode_centres_m[0]
     say(
         f"wrote {path}: {sensor.sheet.shape} of {1e3 * sensor.width_m:.4g} x "
