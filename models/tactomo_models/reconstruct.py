@@ -195,7 +195,7 @@ class Reconstructor:
         saturated: Collection[Channel] = (),
         companions: Collection[tuple[str, float] | CompanionReading] | None = None,
     ) -> Reconstruction:
-        """Reconstruct one frame.
+        """Reconstruct one frame, without the drives and measuring pairs that repeat the last one.
 
         Args:
             magnitude: (M,) volts; None if that scan is missing.
@@ -207,8 +207,11 @@ class Reconstructor:
         Raises:
             DataError: a scan has another number of voltages than the sensor.
         """
-        measurement = self.compare(magnitude, structure, saturated=saturated, companions=companions)
-        return self.solve(measurement)
+        scans = (
+            self._measured(Channel.MAGNITUDE, magnitude),
+            self._measured(Channel.STRUCTURE, structure),
+        )
+        return self.solve(self.compare(*scans, saturated=saturated, companions=companions))
 
     def compare(
         self,
@@ -218,13 +221,14 @@ class Reconstructor:
         saturated: Collection[Channel] = (),
         companions: Collection[tuple[str, float] | CompanionReading] | None = None,
     ) -> Measurement:
-        """The first half of `reconstruct`, which costs little: what has changed."""
+        """What has changed: all that `reconstruct` does before it solves, at little cost.
+
+        A scan may be compared again: unlike `reconstruct`, this looks for nothing that repeats.
+        """
         if self._tare.asks_noise:
             self._tare = self._tare.with_noise_of(magnitude, structure)
             if self._tare.channels is not self._skin.tare.channels:
                 self._prepare()
-        magnitude = self._measured(Channel.MAGNITUDE, magnitude)
-        structure = self._measured(Channel.STRUCTURE, structure)
         measurement = self._tare.changes(magnitude, structure, saturated, companions)
         return self._in_time(measurement, companions or ())
 

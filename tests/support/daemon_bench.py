@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import zmq
@@ -213,6 +213,14 @@ class Listener:
         return self.wait("map", lambda frame: frame["scan_counter"] == counter)
 
 
+class Compared(NamedTuple):
+    """What `Memory` is to solve."""
+
+    magnitude: FloatArray | None
+    structure: FloatArray | None
+    is_saturated: bool
+
+
 class Memory:
     """A reconstructor: half of each map is the map before, until it is told to forget.
 
@@ -244,18 +252,22 @@ class Memory:
     def forget_shape(self) -> None:
         self._before = np.zeros((51, 51), np.float32)
 
-    def reconstruct(
+    def compare(
         self,
         magnitude: FloatArray | None,
         structure: FloatArray | None,
         *,
         saturated: Collection[Channel] = (),
         companions: Collection[CompanionReading] = (),
-    ) -> Reconstruction:
+    ) -> Compared:
         assert not companions
+        return Compared(magnitude, structure, bool(saturated))
+
+    def solve(self, compared: Compared) -> Reconstruction:
+        magnitude, structure, is_saturated = compared
         self.budgets_s.append(self.budget_s)
         time.sleep(self.seconds)
-        flags = Flag.SATURATED if saturated else Flag(0)
+        flags = Flag.SATURATED if is_saturated else Flag(0)
         if magnitude is None:
             flags |= Flag.MAGNITUDE_MISSING
         if structure is None:

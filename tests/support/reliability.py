@@ -28,7 +28,8 @@ These promises hold:
 - No frame contains damaged bytes; each intact scan is published, or counted as dropped.
 - Memory, threads and descriptors stay constant over a million scans and many subscribers.
 - Hostile boards, files and web pages never end the daemon.
-- A frozen converter or drive, a second skin on one daemon and a tare under a press are reported.
+- A frozen converter or drive, a second skin on one daemon and a tare under a press are reported. A
+  converter is frozen where a scan lacks noise against one of the last 16; an F test ends a dispute.
 
 These limits remain:
 
@@ -37,6 +38,7 @@ These limits remain:
   recording to a folder.
 - At the very first tare, a frozen converter or an object on the skin looks like a skin at rest
   ([what to do](your_own_sensor.md)).
+- A board that sends more than 16 old scans round and round is believed.
 - A wide press that begins lightly may be missing in its first frames.
 - Scans that one board delays by half a second behind an honest counter can make a sliding press
   look like drift, or like two contacts: pressures and places are then wrong, without a flag.

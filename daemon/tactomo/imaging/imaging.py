@@ -39,7 +39,7 @@ from tactomo.imaging.frozen_converter import FrozenConverters
 from tactomo.imaging.kept_reference import KeptReference, KnownSkin
 from tactomo.imaging.method_in_force import Effort, MethodInForce
 from tactomo.imaging.processor_share import ProcessorShare
-from tactomo.imaging.tare import Taring, is_at_rest
+from tactomo.imaging.tare import Taring
 from tactomo.recordings.recorder import Recorder
 from tactomo.scans import DualScan, Mark, Timing, Volts
 from tactomo.stream.publisher import Publisher
@@ -265,7 +265,7 @@ class Imaging:
         self._publish_scan(dual, timing, volts)
         volts = self._frozen.without(volts, self.reference)
         before = None if self._doubt is None else self._doubt.before
-        if before is not None and is_at_rest(volts, before.reference):
+        if before is not None and before.reference.is_at_rest(volts):
             self._restore(before)
         clipped = [scan.channel for scan in dual.scans if scan.flags & ScanFlag.SATURATED]
         companions = self._companions.read(dual)
@@ -351,9 +351,10 @@ class Imaging:
         scans = (volts.get(Channel.MAGNITUDE), volts.get(Channel.STRUCTURE))
         try:
             if self._tracker is None or is_exact:
-                frame = self._reconstructor.reconstruct(
+                measurement = self._reconstructor.compare(
                     *scans, saturated=saturated, companions=companions
                 )
+                frame = self._reconstructor.solve(measurement)
             else:
                 acquired_s = self.acquired_monotonic_ns * 1e-9
                 frame = self._tracker.reconstruct(

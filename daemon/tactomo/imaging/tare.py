@@ -22,7 +22,6 @@ import numpy as np
 from tactomo_models import ModelError, Reference
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scans.companion_forces import CompanionReading
-from tactomo_models.scans.frame_noise import noise_limit
 from tactomo_models.scans.tare import Tare
 from tactomo_protocol import Channel
 
@@ -245,20 +244,6 @@ class _Scans:
         sheets = map(stacks.get, (Channel.MAGNITUDE, Channel.STRUCTURE))
         at_rest = tuple((name, float(np.mean(each))) for name, each in self._readings.items())
         return replace(Reference.from_scans(*sheets), companions=at_rest or None)
-
-
-def is_at_rest(volts: Mapping[Channel, Volts], reference: Reference) -> bool:
-    """Whether noise alone explains how scans (M,) differ from the reference."""
-    for channel, scan in volts.items():
-        rest, noise = getattr(reference, channel), getattr(reference, f"{channel}_noise")
-        if rest is None or noise is None:
-            return False
-        changes = (scan - rest)[noise > 0] / noise[noise > 0]
-        freedom = max(1, reference.scans - 1) * len(changes)
-        limit = (1 + 1 / reference.scans) * noise_limit(len(changes), freedom)
-        if not np.sum(changes**2) <= limit:
-            return False
-    return bool(volts)
 
 
 def movement_and_noise(scans: Volts) -> tuple[float, float]:

@@ -76,6 +76,11 @@ def hides_press(
     return bool(squares > ways * variance + told - CERTAIN * spread)
 
 
+def is_noise(squares: FloatArray, freedom: float = np.inf) -> bool:
+    """Whether noise alone explains squares over their variance; see `noise_limit`."""
+    return bool(squares.sum() < noise_limit(squares.size, freedom))
+
+
 @cache
 def noise_limit(count: float, freedom: float = np.inf) -> float:
     """Sum of squares over their variance that noise alone stays below, but for false alarms.

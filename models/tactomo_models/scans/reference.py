@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtri
+from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.errors import DataError
 from tactomo_models.robust import robust_sigma
+from tactomo_models.scans.frame_noise import is_noise
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.pattern import reciprocal_pairs
 
@@ -69,6 +71,18 @@ class Reference:
             scans=min((each[1] for each in seen if each), default=1),
             is_noise_measured=False,
         )
+
+    def is_at_rest(self, scans: Mapping[Channel, FloatArray]) -> bool:
+        """Whether noise alone explains how scans (M,) differ from this one; no drift, no model."""
+        for channel, scan in scans.items():
+            rest, noise = getattr(self, channel), getattr(self, f"{channel}_noise")
+            if rest is None or noise is None:
+                return False
+            told = noise > 0
+            squares = ((scan - rest)[told] / noise[told]) ** 2 / (1 + 1 / self.scans)
+            if not is_noise(squares, freedom=max(1, self.scans - 1) * squares.size):
+                return False
+        return bool(scans)
 
     def is_followed_from(self, other: Reference) -> bool:
         """Whether this is another one's tare, drifted."""

@@ -23,7 +23,7 @@ from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.robust import median, robust_sigma
 from tactomo_models.scans.changes import CORRELATED, WRONG_WAY, Changes, missing
 from tactomo_models.scans.companion_forces import CompanionForce, CompanionReading
-from tactomo_models.scans.frame_noise import FrameNoiseEstimator, hides_press, noise_limit
+from tactomo_models.scans.frame_noise import FrameNoiseEstimator, hides_press, is_noise, noise_limit
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import (
     Flag,
@@ -228,8 +228,8 @@ class ChannelTare:
         # Small changes share in the error of the large ones beside them.
         typical = median(square[valid]) / median_square
         error = self._error_share**2 * (square + typical)
-        statistic = float((square / variance).sum())
-        quiet = statistic < noise_limit(count, freedom)
+        squares = (square / variance)[valid]
+        statistic, quiet = float(squares.sum()), is_noise(squares, freedom)
         if creep is not None:
             unfollowed = (change if quiet else 0.0) + np.sign(self.reference) * creep
             shown = float((valid * unfollowed**2 / variance).sum()) + (0 if quiet else count)

@@ -165,13 +165,13 @@ def test_tier_and_budget_are_answered_when_they_are_in_force(
 def test_a_frame_that_takes_long_holds_up_no_command(
     bench: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    is_made, reconstruct = threading.Event(), Memory.reconstruct
+    is_made, solve = threading.Event(), Memory.solve
 
     def slowly(*given: Any, **details: Any) -> Any:
         assert is_made.wait(PATIENCE_S)
-        return reconstruct(*given, **details)
+        return solve(*given, **details)
 
-    monkeypatch.setattr(Memory, "reconstruct", slowly)
+    monkeypatch.setattr(Memory, "solve", slowly)
     b = bench()
     b.skin.introduce()
     b.skin.scan()

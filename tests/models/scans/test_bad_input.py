@@ -430,6 +430,19 @@ def test_a_press_beside_drives_that_are_stuck_is_told_or_not_known(
         assert frame.contacts or Flag.NOISE_HIGH in frame.flags
 
 
+def test_drives_that_repeat_are_left_out_of_a_frame_and_a_scan_may_be_compared_again(
+    graded: Graded,
+) -> None:
+    pressed = graded.skin.scan(Press(0.015, -0.01, 100.0, 0.012))["magnitude"]
+    stuck = np.where(graded.drives < 8, graded.rest, pressed)
+    made = graded.reconstructor
+    made.reset()
+    made.reconstruct(graded.rest, None)
+    one, other = (made.compare(stuck, None).changes[Channel.MAGNITUDE] for _ in range(2))
+    assert np.array_equal(one.precision, other.precision)
+    assert made.reconstruct(stuck, None).flags == Flag.INVALID_VOLTAGE
+
+
 @pytest.mark.parametrize("pressure_kpa", [180.0, 40.0])
 def test_noise_that_may_hide_a_press_is_told(graded: Graded, pressure_kpa: float) -> None:
     rng = np.random.default_rng(5)
