@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -67,6 +67,14 @@ class Reconstructed(NamedTuple):
     failure: str  # of the first of these: why
 
 
+class ReferencedScans(NamedTuple):
+    """Scans, and what they are measured against."""
+
+    scans: Mapping[str, FloatArray]  # (T, M) volts of each channel
+    reference: Reference
+    companions: Mapping[str, FloatArray]  # (T,) readings of each companion; NaN where there is none
+
+
 def reconstruct_file(
     source: Path,
     target: Path,
@@ -76,7 +84,7 @@ def reconstruct_file(
     curve: PressureCurve | None = None,
     taught: TaughtSkin | None = None,
     progress: Progress | None = None,
-    read: tuple[Mapping[str, FloatArray], Reference] | None = None,
+    read: ReferencedScans | None = None,
 ) -> Reconstructed:
     """Reconstruct every frame of `source` into `target`, one at a time.
 
@@ -90,7 +98,7 @@ def reconstruct_file(
         curve: of a pressure calibration; the description's if None.
         taught: what the skin was taught; None where nothing.
         progress: called with frames done and frames in all.
-        read: scans and reference of `source`, of another layout; None to read them here.
+        read: what `source` holds, of another layout; None to read it here.
 
     Raises:
         DataError: the input cannot be read, has the wrong shape, or no channel of the sensor;
@@ -100,12 +108,7 @@ def reconstruct_file(
     """
     if not target.parent.is_dir():
         raise DataError(f"cannot write {target}: there is no folder {target.parent}; make it first")
-    scans, reference = read or read_scans(source, description)
-    readings: dict[str, FloatArray] | None = None
-    if description.companion and read is None:
-        total = max(len(channel) for channel in scans.values())
-        readings, at_rest = companions_of(source, read_arrays(source), description, total)
-        reference = replace(reference, companions=tuple(at_rest.items()))
+    scans, reference, readings = read or read_scans(source, description)
     if taught is not None and (why := taught.changed(reference)):
         raise CalibrationError(f"what was taught does not fit this skin: {why}; teach it anew")
     nodes = (description.map.nodes_y, description.map.nodes_x)
@@ -127,9 +130,7 @@ def reconstruct_file(
             for index in range(total):
                 magnitude, structure = (_scan(scans, n, index) for n in ("magnitude", "structure"))
                 start = time.perf_counter()
-                companions = None
-                if readings is not None:
-                    companions = [(k, float(each[index])) for k, each in readings.items()]
+                companions = [(name, float(each[index])) for name, each in readings.items()]
                 frame = reconstructor.reconstruct(magnitude, structure, companions=companions)
                 arrays.append({"seconds": time.perf_counter() - start, **_frame_row(frame)})
                 for contact in frame.contacts:
@@ -161,10 +162,8 @@ def _scan(scans: Mapping[str, FloatArray], name: str, index: int) -> FloatArray 
     return np.asarray(channel[index])
 
 
-def read_scans(
-    source: Path, description: SensorDescription
-) -> tuple[dict[str, FloatArray], Reference]:
-    """Read the scans (T, M) of each channel that is there, and their reference.
+def read_scans(source: Path, description: SensorDescription) -> ReferencedScans:
+    """Read the scans of each channel and the readings of each companion that is there.
 
     Raises:
         DataError: the file cannot be read or does not fit the sensor.
@@ -176,7 +175,10 @@ def read_scans(
             f"cannot read {source}: {error.strerror}; give an .npz file of scans"
         ) from error
     scans, references = scans_of(source, arrays, description)
-    return scans, reference_at_rest(source, scans, references, description)
+    count = len(next(iter(scans.values())))
+    readings, at_rest = companions_of(source, arrays, description, count)
+    reference = reference_at_rest(source, scans, references, description, at_rest.items())
+    return ReferencedScans(scans, reference, readings)
 
 
 def companions_of(
@@ -214,8 +216,9 @@ def reference_at_rest(
     scans: Mapping[str, FloatArray],
     references: Mapping[str, FloatArray],
     description: SensorDescription,
+    companions: Collection[tuple[str, float]],
 ) -> Reference:
-    """Return the reference of scans (T, M).
+    """Return the reference of scans (T, M), with what companions read at rest.
 
     Several scans at rest (n, M) tell the noise; of a single one, or a mean (M,), the scans do.
 
@@ -233,6 +236,7 @@ def reference_at_rest(
                 f"{source}: {name}_reference holds no voltage; take the unpressed scan again"
             )
     rest = Reference.at_rest(references.get("magnitude"), references.get("structure"))
+    rest = replace(rest, companions=tuple(companions))
     if not rest.lacks_noise:
         return rest
     # The file does not say how noisy the scans are, nor of how many the reference is the mean.

@@ -182,7 +182,7 @@ def test_a_damaged_archive_is_refused_or_read_as_it_was(
     file = tmp_path_factory.mktemp("flip") / "in.npz"
     file.write_bytes(content)
     try:
-        scans, reference = read_scans(file, paper)
+        scans, reference, _ = read_scans(file, paper)
     except DataError:
         return
     np.testing.assert_array_equal(scans["structure"], volts[None])
@@ -227,7 +227,7 @@ def test_scans_at_rest_tell_their_noise(
         volts[7] = np.nan  # a scan that was not taken
     arrays |= {f"{name}_reference": volts for name, volts in rest.items()}
     np.savez(tmp_path / "in.npz", **arrays)
-    _, reference = read_scans(tmp_path / "in.npz", paper)
+    _, reference, _ = read_scans(tmp_path / "in.npz", paper)
     known = {name: np.delete(volts, 7, axis=0) for name, volts in rest.items()}
     expected = Reference.from_scans(known["magnitude"], known["structure"])
     assert reference.scans == 20
@@ -244,7 +244,7 @@ def test_a_voltage_that_no_scan_at_rest_has_is_left_out(
     rest = np.array([skin.scan()["magnitude"] for _ in range(5)])
     rest[:, 3] = np.nan
     np.savez(tmp_path / "in.npz", **{**arrays, "magnitude_reference": rest})
-    _, reference = read_scans(tmp_path / "in.npz", paper)
+    _, reference, _ = read_scans(tmp_path / "in.npz", paper)
     assert reference.magnitude is not None
     assert np.flatnonzero(np.isnan(reference.magnitude)).tolist() == [3]
 

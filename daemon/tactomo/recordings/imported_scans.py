@@ -107,9 +107,10 @@ class Scans:
         """Return the mean of `frames` as the reference, or else the file's own, or None."""
         if frames is not None:
             chosen = {channel: self._chosen(channel, frames) for channel in Channel}
-            rest = {name: float(np.mean(each[frames])) for name, each in self.companions.items()}
-            known = tuple((name, mean) for name, mean in rest.items() if np.isfinite(mean))
-            return replace(Reference.from_scans(**chosen), companions=known or None)
+            rest = {name: each[frames] for name, each in self.companions.items()}
+            read = {name: each[np.isfinite(each)] for name, each in rest.items()}
+            means = tuple((name, float(np.mean(each))) for name, each in read.items() if len(each))
+            return replace(Reference.from_scans(**chosen), companions=means or None)
         if not self.reference:
             return None
         magnitude, structure = map(self.reference.get, (Channel.MAGNITUDE, Channel.STRUCTURE))

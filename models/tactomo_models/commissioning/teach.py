@@ -7,7 +7,7 @@ the others contradict, and coordinates in another unit or frame, are named.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -54,7 +54,7 @@ Progress = Callable[[int, int], None]
 class KnownPresses:
     """Presses at known places, in order of time."""
 
-    scans: dict[str, FloatArray]  # (P, M) volts of each channel
+    scans: Mapping[str, FloatArray]  # (P, M) volts of each channel
     reference: Reference  # of the unpressed skin
     xy_mm: FloatArray  # (P, 2) where each was, in the description's frame
     force_n: FloatArray  # (P,) how hard each was, newtons; NaN where that is not known
@@ -65,7 +65,7 @@ def read_presses(path: Path, description: SensorDescription) -> KnownPresses:
 
     Raises DataError where the file cannot be read or does not fit the sensor.
     """
-    scans, reference = read_scans(path, description)
+    scans, reference, _ = read_scans(path, description)
     count = len(next(iter(scans.values())))
     arrays = read_arrays(path)
     xy_mm, force_n = arrays.get("xy_mm", np.zeros(0)), arrays.get("force_n", np.full(count, np.nan))

@@ -54,6 +54,35 @@ def test_a_press_is_found_in_a_file(tactomo: Run, tmp_path: Path) -> None:
         assert maps["pressure_kpa"][1].max() == pytest.approx(maps["contact_pressure_kpa"][0])
 
 
+@pytest.mark.parametrize("layout", ["named", "plain"])
+def test_companions_of_a_file_are_judged_in_every_layout(
+    tactomo: Run, tmp_path: Path, layout: str
+) -> None:
+    assert tactomo("models", "copy", "graded_square", "cell.toml").returncode == 0
+    with (tmp_path / "cell.toml").open("a") as file:
+        file.write("[companion.cell]\ngain_n_per_unit = 2.0\nnoise_n = 0.1\n")
+    skin = SkinSimulator(load_description(tmp_path / "cell.toml"))
+    press = Press(x_m=0.03, y_m=0.03, pressure_kpa=180.0, radius_m=0.015)
+    [force_n] = skin.forces_n([press]).values()
+    [pressed], [empty] = skin.voltages([press]).values(), skin.voltages([]).values()
+    noise = 1e-3 * np.abs(pressed - empty).max() * np.random.default_rng(0).normal(size=(23, 208))
+    volts, rest = ("magnitude", "magnitude_reference") if layout == "named" else ("data", "vh")
+    at_rest = 7.0
+    arrays = {
+        volts: pressed + noise[:3],
+        rest: empty + noise[3:],
+        "companion_cell": at_rest + np.array([force_n / 2, np.nan, 3 * force_n / 2]),
+        "companion_cell_reference": at_rest,
+    }
+    np.savez(tmp_path / "in.npz", **arrays)
+    result = tactomo("reconstruct", "in.npz", "out.npz", "-d", "cell.toml")
+    assert result.returncode == 0, result.stderr
+    with np.load(tmp_path / "out.npz") as maps:
+        names = [Flag(int(flags)).names() for flags in maps["flags"]]
+        assert names == [[], ["companion_missing"], ["companion_disputed"]]
+        assert maps["force_n"][0] == pytest.approx(force_n, rel=0.02)
+
+
 @pytest.mark.slow
 def test_a_calibration_says_how_hard_is_pressed(tactomo: Run, tmp_path: Path) -> None:
     sensor = load_description("paper_square")

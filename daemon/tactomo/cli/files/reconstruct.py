@@ -73,12 +73,13 @@ def reconstruct(
     OUT may be an earlier result of this command; other files are overwritten only with `--force`.
 
     IN holds `magnitude` and `structure` (T, M) in volts, and `magnitude_reference`,
-    `structure_reference` (M,), or (n, M) scans at rest; structure may be missing. IN may also be a
-    file that `tactomo import` reads, or hold frames of one channel, a frame per row or column: an
-    array of a .mat (up to version 7), or numbers in text (.csv, .txt). The reference is then an
-    array called reference, baseline, rest, empty or vh, `--reference-frames` of IN, or the mean of
-    the file `--reference`. `--pattern 32:adjacent`, `16:opposite:adjacent` or `16:adjacent:rotated`
-    replaces the description's electrodes and pattern.
+    `structure_reference` (M,), or (n, M) scans at rest; structure may be missing. `companion_NAME`
+    (T,) holds readings of a companion of the description, `companion_NAME_reference` those at rest.
+    IN may also be a file that `tactomo import` reads, or hold frames of one channel, a frame per
+    row or column: an array of a .mat (up to version 7), or numbers in text (.csv, .txt). The
+    reference is then an array called reference, baseline, rest, empty or vh, `--reference-frames`
+    of IN, or the mean of the file `--reference`. `--pattern 32:adjacent`, `16:opposite:adjacent` or
+    `16:adjacent:rotated` replaces the description's electrodes and pattern.
 
     OUT holds, for T frames: `map` (T, ny, nx), the relative conductivity change; `pressure_kpa` (T,
     ny, nx), NaN where unknown; `structure` (T, ny, nx), 0 bare to 1 pressed (-1 for objects that
@@ -113,7 +114,7 @@ def reconstruct(
     several methods, OUT holds the maps of the first; the picture shows all.
     """
     from tactomo_models import load_description
-    from tactomo_models.batch import reconstruct_file, reference_at_rest
+    from tactomo_models.batch import ReferencedScans, reconstruct_file, reference_at_rest
     from tactomo_models.calibration.calibration_file import calibration_of
     from tactomo_models.calibration.taught_skin import taught_of
     from tactomo_models.sensor.named_pattern import NamedPattern
@@ -140,7 +141,8 @@ def reconstruct(
         reference = read.reference_of(frames_at_rest) if frames_at_rest else None
     if reference is None:
         own = {str(name): volts for name, volts in read.reference.items()}
-        reference = reference_at_rest(scans, given, own, sensor)
+        at_rest = read.companions_at_rest.items()
+        reference = reference_at_rest(scans, given, own, sensor, at_rest)
     elif reference.lacks_noise:
         reference = reference.with_noise_of(sensor, *map(given.get, Channel))
     for note in read.notes:
@@ -154,7 +156,7 @@ def reconstruct(
                 made = reconstruct_file(
                     scans,
                     file,
-                    read=(given, reference),
+                    read=ReferencedScans(given, reference, read.companions),
                     description=sensor,
                     method=name,
                     progress=show,
