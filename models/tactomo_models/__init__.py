@@ -33,39 +33,41 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from tactomo_protocol import Channel
+if TYPE_CHECKING:  # `as` tells type checkers that a name is for users
+    from tactomo_protocol import Channel as Channel
 
-    from tactomo_models.drift.baseline import BaselineTracker
-    from tactomo_models.errors import (
-        ArtifactError,
-        CalibrationError,
-        DataError,
-        DescriptionError,
-        MethodError,
-        ModelError,
-    )
-    from tactomo_models.methods.method import Estimate, Method, Skin, UnsolvableError
-    from tactomo_models.methods.registry import METHODS, available_methods
-    from tactomo_models.physics.artifact import (
-        Artifact,
-        build_artifact,
-        default_path,
-        load_artifact,
-        load_or_build_artifact,
-        save_artifact,
-    )
-    from tactomo_models.reconstruct import Reconstructor
-    from tactomo_models.scans.measurement import Measurement
-    from tactomo_models.scans.plausibility import Flag
-    from tactomo_models.scans.reference import Reference
-    from tactomo_models.scene.contacts import Contact
-    from tactomo_models.scene.press import Press
-    from tactomo_models.scene.pressure import PressureCurve, PressureRange
-    from tactomo_models.scene.reconstruction import Reconstruction
-    from tactomo_models.sensor.description import SensorDescription
-    from tactomo_models.sensor.description_file import load_description, shipped_descriptions
-    from tactomo_models.simulation.simulator import SkinSimulator
+    from tactomo_models.drift.baseline import BaselineTracker as BaselineTracker
+    from tactomo_models.errors import ArtifactError as ArtifactError
+    from tactomo_models.errors import CalibrationError as CalibrationError
+    from tactomo_models.errors import DataError as DataError
+    from tactomo_models.errors import DescriptionError as DescriptionError
+    from tactomo_models.errors import MethodError as MethodError
+    from tactomo_models.errors import ModelError as ModelError
+    from tactomo_models.methods.method import Estimate as Estimate
+    from tactomo_models.methods.method import Method as Method
+    from tactomo_models.methods.method import Skin as Skin
+    from tactomo_models.methods.method import UnsolvableError as UnsolvableError
+    from tactomo_models.methods.registry import METHODS as METHODS
+    from tactomo_models.methods.registry import available_methods as available_methods
+    from tactomo_models.physics.artifact import Artifact as Artifact
+    from tactomo_models.physics.artifact import build_artifact as build_artifact
+    from tactomo_models.physics.artifact import default_path as default_path
+    from tactomo_models.physics.artifact import load_artifact as load_artifact
+    from tactomo_models.physics.artifact import load_or_build_artifact as load_or_build_artifact
+    from tactomo_models.physics.artifact import save_artifact as save_artifact
+    from tactomo_models.reconstruct import Reconstructor as Reconstructor
+    from tactomo_models.scans.measurement import Measurement as Measurement
+    from tactomo_models.scans.plausibility import Flag as Flag
+    from tactomo_models.scans.reference import Reference as Reference
+    from tactomo_models.scene.contacts import Contact as Contact
+    from tactomo_models.scene.press import Press as Press
+    from tactomo_models.scene.pressure import PressureCurve as PressureCurve
+    from tactomo_models.scene.pressure import PressureRange as PressureRange
+    from tactomo_models.scene.reconstruction import Reconstruction as Reconstruction
+    from tactomo_models.sensor.description import SensorDescription as SensorDescription
+    from tactomo_models.sensor.description_file import load_description as load_description
+    from tactomo_models.sensor.description_file import shipped_descriptions as shipped_descriptions
+    from tactomo_models.simulation.simulator import SkinSimulator as SkinSimulator
 
 _NAMES = {
     "tactomo_protocol": "Channel",
@@ -91,6 +93,7 @@ _NAMES = {
     "tactomo_models.simulation.simulator": "SkinSimulator",
 }
 _HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
@@ -99,40 +102,3 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = globals()[name] = getattr(import_module(_HOMES[name]), name)
     return value
-
-
-__all__ = [
-    "METHODS",
-    "Artifact",
-    "ArtifactError",
-    "BaselineTracker",
-    "CalibrationError",
-    "Channel",
-    "Contact",
-    "DataError",
-    "DescriptionError",
-    "Estimate",
-    "Flag",
-    "Measurement",
-    "Method",
-    "MethodError",
-    "ModelError",
-    "Press",
-    "PressureCurve",
-    "PressureRange",
-    "Reconstruction",
-    "Reconstructor",
-    "Reference",
-    "SensorDescription",
-    "Skin",
-    "SkinSimulator",
-    "UnsolvableError",
-    "available_methods",
-    "build_artifact",
-    "default_path",
-    "load_artifact",
-    "load_description",
-    "load_or_build_artifact",
-    "save_artifact",
-    "shipped_descriptions",
-]

@@ -40,8 +40,7 @@ class _Library:
     def load(self) -> None:
         """Load the library.
 
-        Raises:
-            ModelError: there is none, or it is not of this machine and version.
+        Raises ModelError where there is none, or it is not of this machine and version.
         """
         if "evaluate" not in self.__dict__:
             self.__dict__ |= _functions(_PATH)

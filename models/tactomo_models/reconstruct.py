@@ -143,8 +143,7 @@ class Reconstructor:
 
         Forgets the warm start, unless it is the last reference, drifted.
 
-        Raises:
-            DataError: a channel has another number of voltages than the sensor.
+        Raises DataError where a channel has another number of voltages than the sensor.
         """
         if reference.is_followed_from(self._tare.reference):
             self._tare = replace(self._tare, reference=reference)
@@ -162,8 +161,7 @@ class Reconstructor:
 
         Half a second of processor time a sheet, if the method solves presses on sheets as they are.
 
-        Raises:
-            DataError: a channel has another number of voltages than the sensor.
+        Raises DataError where a channel has another number of voltages than the sensor.
         """
         tare = Tare.take(self._tare.sensor, reference)
         if getattr(self._methods[self._name], "uses_sheets", False):
@@ -204,8 +202,7 @@ class Reconstructor:
             companions: name of each companion and its reading in its own unit, NaN where it has
                 none, or `CompanionReading`; None where nobody reads them.
 
-        Raises:
-            DataError: a scan has another number of voltages than the sensor.
+        Raises DataError where a scan has another number of voltages than the sensor.
         """
         scans = (
             self._measured(Channel.MAGNITUDE, magnitude),

@@ -10,16 +10,14 @@ from tactomo_models.scans.changes import Changes
 
 
 def fit_magnitudes(
-    forward: ForwardModel, on_nodes: FloatArray, measured: Changes, *, solves: int = 3
+    forward: ForwardModel,  # the model of the sheet
+    # (K, P) share of each pressable node that each of at least one area covers
+    on_nodes: FloatArray,
+    measured: Changes,  # the magnitude channel's changes
+    *,
+    solves: int = 3,  # forward solves allowed
 ) -> Magnitudes:
-    """Fit each area's conductivity change by Gauss-Newton.
-
-    Args:
-        forward: the model of the sheet.
-        on_nodes: (K, P) share of each pressable node that each of at least one area covers.
-        measured: the magnitude channel's changes.
-        solves: forward solves allowed.
-    """
+    """Fit each area's conductivity change by Gauss-Newton."""
     change = np.zeros(len(on_nodes))
     for _ in range(solves):
         fitted = step(_tangent(forward, on_nodes, change), measured)

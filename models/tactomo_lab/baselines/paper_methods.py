@@ -136,8 +136,7 @@ class _PaperNetworkMethod:
     def check(cls, description: SensorDescription) -> None:
         """Make sure that there is such a network.
 
-        Raises:
-            ArtifactError: it is missing or cannot be used.
+        Raises ArtifactError where it is missing or cannot be used.
         """
         load_paper_network(description, cls.kind)
 

@@ -21,8 +21,7 @@ FILTER_SIGMA: Final = 1.0  # nodes, of the Gaussian filter at the networks' outp
 def load_paper_network(description: SensorDescription, kind: str) -> Network:
     """Load one of a sensor's networks of the paper: `cnn-single` or `cnn-multimodal`.
 
-    Raises:
-        ArtifactError: there is none, or it cannot be used.
+    Raises ArtifactError where there is none, or it cannot be used.
     """
     return load_network(description, kind, None, SHIPPED)
 
@@ -53,14 +52,10 @@ class PaperNetwork:
 
 
 def preprocessed(
-    images: Mapping[Any, FloatArray | Image], input_scale: float
+    images: Mapping[Any, FloatArray | Image],  # preliminary images (..., nodes_y, nodes_x)
+    input_scale: float,  # largest value of all magnitude images trained on
 ) -> dict[str, FloatArray | Image]:
-    """Negative truncation; global 0-1 normalisation of magnitudes, of each instance of structure.
-
-    Args:
-        images: preliminary images (..., nodes_y, nodes_x).
-        input_scale: largest value of all magnitude images trained on.
-    """
+    """Truncate negatives; normalise to 0-1: magnitudes by one scale, each structure by its own."""
     ready: dict[str, FloatArray | Image] = {}
     for name, image in images.items():
         positive = np.maximum(image, 0.0)

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import chain
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 from tactomo.cli import options
-from tactomo.cli.output import print_json, table
-from tactomo.errors import TactomoError
+from tactomo.cli.output import table
 
-from tactomo_lab.commands.report import Seeds, chosen_names, shown
+from tactomo_lab.commands.report import Seeds, chosen_names, shown, tell, usable
 
 if TYPE_CHECKING:
     from rich.table import Table
+    from tactomo.cli.console import Console
     from tactomo_models import SensorDescription
 
     from tactomo_lab.evaluation.paper import Arrangement, Frame, Rig
@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 FIGURES = (5, 8, 9, 10, 11, 12)
 
 
-@dataclass(frozen=True)
-class _Part:
+class _Part(NamedTuple):
     """What came out of one experiment."""
 
     title: str
@@ -34,13 +33,12 @@ class _Part:
     facts: dict[int, Any]
 
 
-@dataclass(frozen=True)
-class _Study:
+class _Study(NamedTuple):
     """What was asked for."""
 
     description: SensorDescription
     seeds: Any
-    count: int
+    scenes: int  # of each number of contacts
     rigs: Sequence[Rig]
     methods: Sequence[str]
 
@@ -85,22 +83,30 @@ def paper(
     from tactomo_models import load_description
 
     from tactomo_lab.evaluation.paper import DEFAULT_METHODS, Rig
-    from tactomo_lab.evaluation.trade_off import left_out
 
     figures = {int(name) for name in chosen_names(figure, map(str, FIGURES), "--figure")}
-    wanted = method or DEFAULT_METHODS
     description = load_description(sensor)
-    missing = left_out(description, wanted)
-    methods = [name for name in wanted if name not in missing]
-    if not methods:
-        why = "; ".join(f"{name}: {reason}" for name, reason in missing.items())
-        raise TactomoError(
-            f"none of the methods is available: {why}", "choose others with --method"
-        )
+    methods = usable(description, method or DEFAULT_METHODS)
     numbers = shown(range(sheets), sheets, "simulating sheets at rest")
     rigs = [Rig(description, seeds, number, snr_db=snr) for number in numbers]
     study = _Study(description, seeds, count, rigs, methods)
-    settings = {
+    parts = [
+        experiment(study, asked)
+        for of_figures, experiment in EXPERIMENTS.items()
+        if (asked := figures.intersection(of_figures))
+    ]
+
+    def show(console: Console) -> None:
+        console.print(
+            f"Ours are simulated, not measured: {description.name}, {seeds} seeds; Figs. 8 to 12 "
+            f"on {sheets} uneven sheet(s), {snr:g} dB of the voltages at rest, one scan a press."
+        )
+        for part in parts:
+            console.print(f"\n{part.title}", style="italic")
+            console.print(part.table)
+            console.print(part.caption, style="dim")
+
+    told = {
         "simulated": True,
         "sensor": description.name,
         "seeds": seeds,
@@ -108,21 +114,9 @@ def paper(
         "sheets": sheets,
         "snr_of_voltages_db": snr,
         "methods": methods,
-        "left_out": missing,
+        "figures": {str(n): found for part in parts for n, found in part.facts.items()},
     }
-    if not as_json:
-        _print_settings(settings)
-    facts: dict[str, Any] = {}
-    for numbers_of, experiment in EXPERIMENTS.items():
-        asked = figures.intersection(numbers_of)
-        if not asked:
-            continue
-        part = experiment(study, asked)
-        facts |= {str(number): found for number, found in part.facts.items()}
-        if not as_json:
-            _print(part)
-    if as_json:
-        print_json({**settings, "figures": facts})
+    tell(told, as_json, show)
 
 
 def _simulation_study(study: _Study, asked: set[int]) -> _Part:
@@ -130,10 +124,10 @@ def _simulation_study(study: _Study, asked: set[int]) -> _Part:
     from tactomo_lab.evaluation.play import play
 
     drawn = chain.from_iterable(
-        paper_scenes(study.description, study.seeds, study.count, snr_db=snr_db)
+        paper_scenes(study.description, study.seeds, study.scenes, snr_db=snr_db)
         for snr_db in SNR_DB
     )
-    total = study.count * len(COUNTS) * len(SNR_DB) * len(study.methods)
+    total = study.scenes * len(COUNTS) * len(SNR_DB) * len(study.methods)
     points = cells(shown(play(drawn, *study.methods), total, "Fig. 5"))
     measures = (f"{measure} {n}" for measure in ("RIE", "ICC") for n in COUNTS)
     made = table("noise", "method", *measures, left=("method",))
@@ -148,7 +142,7 @@ def _simulation_study(study: _Study, asked: set[int]) -> _Part:
     return _Part(
         "Fig. 5: error and correlation of the map by number of contacts, simulated",
         made,
-        "",
+        "noise: of the voltages' changes",
         {5: [asdict(point) for point in points]},
     )
 
@@ -213,10 +207,7 @@ def _localisation(study: _Study, asked: set[int]) -> _Part:
             f"{sum(place.contacts == 1 for place in of) / len(of):.0%}",
         )
     facts = {
-        "places": [
-            asdict(p) | {"mass_error_mm": p.mass_error_mm, "contact_error_mm": p.contact_error_mm}
-            for p in places
-        ],
+        "places": [asdict(place) for place in places],
         "paper_hardware": {
             method: {"mean_mm": mean, "std_mm": deviation}
             for method, (mean, deviation) in PAPER_LOCALISATION_MM.items()
@@ -254,14 +245,14 @@ def _several_areas(study: _Study, asked: set[int]) -> _Part:
                 f"{mean(one.counted for one in of):.0%}",
             )
         made.add_section()
-    facts: dict[int, Any] = {}
-    for number, of_figure in cases.items():
-        numbers = {case.number for case in of_figure}
-        facts[number] = [
+    facts = {
+        number: [
             asdict(one) | {"ordered": one.ordered, "alike": one.alike}
             for one in read
-            if one.case in numbers
+            if one.case in {case.number for case in of_figure}
         ]
+        for number, of_figure in cases.items()
+    }
     return _Part(
         "Figs. 11 and 12: two to four areas, simulated; the paper prints no numbers",
         made,
@@ -281,9 +272,10 @@ EXPERIMENTS: dict[tuple[int, ...], Callable[[_Study, set[int]], _Part]] = {
 
 
 def _image(study: _Study, cases: Sequence[Arrangement], what: str) -> list[Frame]:
-    from tactomo_lab.evaluation.paper import frames_of, image_cases
+    from tactomo_lab.evaluation.paper import image_cases
 
-    total = frames_of(cases) * len(study.rigs) * len(study.methods)
+    presses = sum(len(case.pressures_kpa) for case in cases)
+    total = presses * len(study.rigs) * len(study.methods)
     return list(shown(image_cases(study.rigs, cases, study.methods), total, what))
 
 
@@ -296,26 +288,3 @@ def _mean_and_deviation(values: Iterable[float], form: str) -> str:
         return "-"
     mean = form.format(np.mean(known))
     return f"{mean} ± {form.format(np.std(known))}" if len(known) > 1 else mean
-
-
-def _print_settings(settings: dict[str, Any]) -> None:
-    from tactomo.cli.console import Console
-
-    console = Console()
-    console.print(
-        f"Ours are simulated, not measured: {settings['sensor']}, {settings['seeds']} seeds; "
-        f"Figs. 8 to 12 on {settings['sheets']} uneven sheet(s), "
-        f"{settings['snr_of_voltages_db']:g} dB of the voltages at rest, one scan a press."
-    )
-    for method, why in settings["left_out"].items():
-        console.print(f"{method} is left out: {why}", style="yellow")
-
-
-def _print(part: _Part) -> None:
-    from tactomo.cli.console import Console
-
-    console = Console()
-    console.print(f"\n{part.title}", style="italic")
-    console.print(part.table)
-    if part.caption:
-        console.print(part.caption, style="dim")

@@ -30,17 +30,11 @@ class Measured(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """A kind of measured sets.
+    """A kind of measured sets."""
 
-    Attributes:
-        arrays: what sets of the kind are recognised by: the names of their arrays.
-        description: the shipped sensor that public sets are of.
-        measure: what measures a set, of its path and its sensor.
-    """
-
-    arrays: tuple[str, ...]
-    description: str
-    measure: Callable[[Path, str], Measured]
+    arrays: tuple[str, ...]  # what sets of the kind are recognised by: the names of their arrays
+    description: str  # the shipped sensor that public sets are of
+    measure: Callable[[Path, str], Measured]  # what measures a set, of its path and its sensor
 
 
 def tank_of(sensor: str) -> SensorDescription:

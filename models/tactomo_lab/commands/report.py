@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, Ty
 import typer
 from tactomo.cli.output import print_json, say, table
 from tactomo.cli.plot.plot import picture_option
+from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -171,10 +172,15 @@ def chosen_names(text: str | None, known: Iterable[str], option: str) -> list[st
 
 
 def usable(sensor: SensorDescription, methods: Sequence[str]) -> list[str]:
-    """Return the methods that serve a sensor; say on standard error why others are left out."""
+    """Return the methods that serve a sensor; say on standard error why others are left out.
+
+    Raises TactomoError where none does.
+    """
     from tactomo_lab.evaluation.trade_off import left_out
 
     missing = left_out(sensor, methods)
     for method, reason in missing.items():
         say(f"left out: {method}: {reason}", err=True)
+    if len(missing) == len(methods):
+        raise TactomoError("none of the methods is available", "choose others with --method")
     return [method for method in methods if method not in missing]

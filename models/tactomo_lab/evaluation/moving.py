@@ -315,19 +315,16 @@ class Lane(Press):
 
 
 def mixed_sequence(
-    description: SensorDescription, seed_set: SeedSet, number: int, noise_of: NoiseOf
+    description: SensorDescription,  # the sensor
+    seed_set: SeedSet,  # which of the two sets of seeds
+    number: int,  # of the sequence; the presses are the same whatever the noise
+    # "each change": 40 dB under the change of each frame, and none at rest, of which there is one
+    # scan; "voltage": 60 dB under the voltages at rest
+    noise_of: NoiseOf,
 ) -> Case:
     """Draw and simulate presses of mixed kinds that move: about 40 s, or read from the cache.
 
-    Args:
-        description: the sensor.
-        seed_set: which of the two sets of seeds.
-        number: of the sequence; the presses are the same whatever the noise.
-        noise_of: "each change": 40 dB under the change of each frame, and none at rest, of which
-            there is one scan; "voltage": 60 dB under the voltages at rest.
-
-    Raises:
-        DataError: the sensor has no room for what presses.
+    Raises DataError where the sensor has no room for what presses.
     """
     draw = Draw(
         description, np.random.default_rng(seed_of(seed_set, "mixed-moving", number)), number

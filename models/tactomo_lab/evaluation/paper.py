@@ -273,11 +273,6 @@ class Frame:
         return magnitude_estimate(self.image, self.method)
 
 
-def frames_of(cases: Sequence[Arrangement]) -> int:
-    """How many presses the cases are."""
-    return sum(len(case.pressures_kpa) for case in cases)
-
-
 def image_cases(
     rigs: Iterable[Rig], arrangements: Sequence[Arrangement], methods: Sequence[str]
 ) -> Iterator[Frame]:
@@ -386,33 +381,22 @@ class Localisation:
     # (x, y) of the largest contact reported; NaN where there was none
     contact_m: tuple[float, float]
     contacts: int  # how many were reported
-
-    @property
-    def mass_error_mm(self) -> float:
-        """Distance of the image's mass from the indenter."""
-        return self._distance_mm(self.mass_m)
-
-    @property
-    def contact_error_mm(self) -> float:
-        """Distance of the contact from the indenter."""
-        return self._distance_mm(self.contact_m)
-
-    def _distance_mm(self, place_m: tuple[float, float]) -> float:
-        return 1e3 * float(np.hypot(place_m[0] - self.x_m, place_m[1] - self.y_m))
+    # mass_error_mm, contact_error_mm: distances of both from the indenter
+    mass_error_mm: float
+    contact_error_mm: float
 
 
 def locate(frame: Frame, description: SensorDescription) -> Localisation:
     """Where a frame of `LOCALISATION` says that the indenter is."""
     (true,) = frame.truth.contacts
     contact = largest_contact(frame.made.contacts)
+    mass_m = image_mass(frame.image, description)
+    contact_m = (contact.x_m, contact.y_m) if contact else (float("nan"), float("nan"))
+    errors_mm = (1e3 * float(np.hypot(x - true.x_m, y - true.y_m)) for x, y in (mass_m, contact_m))
     return Localisation(
-        method=frame.method,
-        sheet=frame.sheet,
-        x_m=true.x_m,
-        y_m=true.y_m,
-        mass_m=image_mass(frame.image, description),
-        contact_m=(contact.x_m, contact.y_m) if contact else (float("nan"), float("nan")),
-        contacts=len(frame.made.contacts),
+        *(frame.method, frame.sheet, true.x_m, true.y_m, mass_m, contact_m),
+        len(frame.made.contacts),
+        *errors_mm,
     )
 
 

@@ -83,9 +83,8 @@ class Player:
     def play(self, case: Case, variant: Variant) -> Iterator[Played]:
         """Reconstruct a case's frames from a cold start.
 
-        Raises:
-            ModelError: the method is not to be had for this sensor, or is the user's own and
-                failed.
+        Raises ModelError where the method is not to be had for this sensor, or is the user's own
+        and failed.
         """
         reconstructor = self._reconstructor
         self.tracker = BaselineTracker(reconstructor) if case.is_followed else None
@@ -124,8 +123,7 @@ def play(cases: Iterable[Case], *methods: str | Variant) -> Iterator[Outcome]:
         cases: of any sensors.
         *methods: of reconstruction, as `tactomo reconstruct` has them, or variants of such.
 
-    Raises:
-        ModelError: a method is not to be had for a sensor, or is the user's own and failed.
+    Raises ModelError where a method is not to be had for a sensor, or is the user's own and failed.
     """
     variants = [Variant(m) if isinstance(m, str) else m for m in methods]
     players: dict[SensorDescription, Player] = {}

@@ -92,23 +92,17 @@ def draw_indenter(
 
 
 def placed_apart(
-    description: SensorDescription,
-    count: int,
-    least_gap_m: float,
-    draw: Callable[[], Placed],
+    description: SensorDescription,  # the sensor
+    count: int,  # of contacts
+    least_gap_m: float,  # between two outlines
+    draw: Callable[[], Placed],  # draws a contact anywhere
     *,
+    # of each contact before all are drawn anew; 40 a contact, for all together, if None
     tries: int | None = None,
 ) -> tuple[Placed, ...]:
     """Draw contacts inside the sensing area that lie apart; anew from the first if one has no room.
 
     Those that have no room for long are drawn smaller.
-
-    Args:
-        description: the sensor.
-        count: of contacts.
-        least_gap_m: between two outlines.
-        draw: draws a contact anywhere.
-        tries: of each contact before all are drawn anew; 40 a contact, for all together, if None.
 
     Raises DataError where there is no room.
     """

@@ -81,8 +81,7 @@ def paper_presses(
 ) -> tuple[Press, ...]:
     """Draw ellipses that do not overlap, as the paper trains and tests on (section III-C-2).
 
-    Raises:
-        DataError: there is no room for so many.
+    Raises DataError where there is no room for so many.
     """
     assert description.magnitude is not None
     curve = PressureCurve.of_response(description.magnitude.response)
@@ -104,8 +103,7 @@ def paper_presses(
 def draw_scene(description: SensorDescription, seed: int, number: int) -> TrainingScene:
     """Draw none to ten contacts of any form and pressure, on sheets as uneven as real ones.
 
-    Raises:
-        DataError: there is no room for so many contacts.
+    Raises DataError where there is no room for so many contacts.
     """
     rng = np.random.default_rng(seed_of("training", "robust", seed, number))
     skin = np.random.default_rng(seed_of("training", "robust skin", seed, number // SAME_SKIN))

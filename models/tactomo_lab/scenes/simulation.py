@@ -68,25 +68,19 @@ AS_MADE = SheetState()
 
 
 class UnevenSkin:
-    """The sheets of one sensor, uneven in their own way, and what they show of presses.
-
-    Args:
-        description: the sensor; its responses are the true ones.
-        mesh: see `fine_mesh`; of a sensor of the same geometry.
-        seed: of the unevenness.
-        unevenness: standard deviation of each sheet's smooth conductivity error.
-        impedance_deviation: standard deviation of the logarithm of the contact impedances.
-        warp: moves the nodes of a mesh to where they are on this skin; they stay if None.
-    """
+    """The sheets of one sensor, uneven in their own way, and what they show of presses."""
 
     def __init__(
         self,
-        description: SensorDescription,
-        mesh: SheetMesh,
-        seed: np.random.SeedSequence,
+        description: SensorDescription,  # the sensor; its responses are the true ones
+        mesh: SheetMesh,  # see `fine_mesh`; of a sensor of the same geometry
+        seed: np.random.SeedSequence,  # of the unevenness
         *,
+        # standard deviation of each sheet's smooth conductivity error
         unevenness: float = UNEVENNESS,
+        # standard deviation of the logarithm of the contact impedances
         impedance_deviation: float = IMPEDANCE_DEVIATION,
+        # moves the nodes of a mesh to where they are on this skin; they stay if None
         warp: Warp | None = None,
     ) -> None:
         self.description = description
@@ -165,20 +159,14 @@ def centroids(sheet: SheetMesh) -> FloatArray:
 
 
 def fitted_mesh(
-    sheet: SheetMesh,
-    presses: Sequence[Press],
-    description: SensorDescription,
+    sheet: SheetMesh,  # mesh with its nodes and electrodes in place
+    presses: Sequence[Press],  # what presses
+    description: SensorDescription,  # the sensor
+    # moves the nodes to where they are when an outline cuts them; what is returned is still in
+    # place
     warp: Warp = lambda mesh: mesh,
 ) -> SheetMesh:
-    """Halve the triangles that an outline cuts, `OUTLINE_REFINEMENTS` times.
-
-    Args:
-        sheet: mesh with its nodes and electrodes in place.
-        presses: what presses.
-        description: the sensor.
-        warp: moves the nodes to where they are when an outline cuts them; what is returned is
-            still in place.
-    """
+    """Halve the triangles that an outline cuts, `OUTLINE_REFINEMENTS` times."""
     mesh = sheet.mesh
     for _ in range(OUTLINE_REFINEMENTS):
         x, y = warp(SheetMesh(mesh, ())).mesh.p
@@ -191,15 +179,11 @@ def fitted_mesh(
 
 
 def displaced(
-    sheet: SheetMesh, description: SensorDescription, displaced_m: FloatArray
+    sheet: SheetMesh,  # mesh with the electrodes in place
+    description: SensorDescription,  # the sensor
+    displaced_m: FloatArray,  # (L,) by how much along the rim, counter-clockwise
 ) -> SheetMesh:
-    """Mesh of a sheet whose electrodes sit off their places.
-
-    Args:
-        sheet: mesh with the electrodes in place.
-        description: the sensor.
-        displaced_m: (L,) by how much along the rim, counter-clockwise.
-    """
+    """Mesh of a sheet whose electrodes sit off their places."""
     ends, centres = description.electrode_ends_m, description.electrode_centres_m
     along = ends[:, 1] - ends[:, 0]
     step = displaced_m[:, None] * along / np.linalg.norm(along, axis=1, keepdims=True)

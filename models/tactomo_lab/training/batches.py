@@ -38,19 +38,12 @@ HELD_OUT = 0.04  # share of the scenes, the last ones, that training never sees
 
 @dataclass(frozen=True)
 class Batch:
-    """Some scenes, ready for the network.
+    """Some scenes, ready for the network."""
 
-    Attributes:
-        inputs: (n, K) filtered data.
-        map: (n, rows, columns) |relative conductivity change|.
-        pressed: (n, rows, columns) 0 to 1.
-        contacts: (n,) how many.
-    """
-
-    inputs: Tensor
-    map: Tensor
-    pressed: Tensor
-    contacts: Tensor
+    inputs: Tensor  # (n, K) filtered data
+    map: Tensor  # (n, rows, columns) |relative conductivity change|
+    pressed: Tensor  # (n, rows, columns) 0 to 1
+    contacts: Tensor  # (n,) how many
 
 
 class SceneBatches:
@@ -98,20 +91,14 @@ class SceneBatches:
 
     def draw(
         self,
-        scenes: Tensor,
-        random: torch.Generator,
+        scenes: Tensor,  # their numbers
+        random: torch.Generator,  # draws the noise
         *,
+        # ratio of the root mean squares of the changes and of the noise; drawn if None
         snr_db: float | None = None,
-        turn: int = 0,
+        turn: int = 0,  # number of the symmetry that is applied
     ) -> Batch:
-        """Make a batch of some scenes.
-
-        Args:
-            scenes: their numbers.
-            random: draws the noise.
-            snr_db: ratio of the root mean squares of the changes and of the noise; drawn if None.
-            turn: number of the symmetry that is applied.
-        """
+        """Make a batch of some scenes."""
         symmetry = self._symmetries[turn]
         count = len(scenes)
         of_change = (
@@ -179,21 +166,13 @@ class _Channel:
 
     def filtered(
         self,
-        scenes: Tensor,
-        strength: Tensor,
-        dead: Tensor,
-        symmetry: Symmetry,
-        random: torch.Generator,
+        scenes: Tensor,  # (n,) their numbers
+        strength: Tensor,  # (n,) standard deviation of the noise, volts
+        dead: Tensor,  # (n,) whether an electrode says nothing
+        symmetry: Symmetry,  # that is applied
+        random: torch.Generator,  # draws noise and electrodes
     ) -> tuple[Tensor, Tensor]:
-        """Filtered data (n, K) and known shares (n, BANDS) of scenes with noise of that strength.
-
-        Args:
-            scenes: (n,) their numbers.
-            strength: (n,) standard deviation of the noise, volts.
-            dead: (n,) whether an electrode says nothing.
-            symmetry: that is applied.
-            random: draws noise and electrodes.
-        """
+        """Filtered data (n, K) and known shares (n, BANDS) of scenes with such noise."""
         order = torch.as_tensor(symmetry.scan)
         sign = torch.as_tensor(symmetry.sign, dtype=torch.float32)
         change = self._change[scenes][:, order] * sign

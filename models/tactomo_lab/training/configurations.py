@@ -60,9 +60,8 @@ class Prepared:
 def check_scenes(folder: Path, description: SensorDescription) -> None:
     """Refuse scenes of another sensor.
 
-    Raises:
-        ModelError: they are of another sensor, or of the preset `paper` of versions before; or
-            there are none.
+    Raises ModelError where they are of another sensor, or of the preset `paper` of versions before;
+    or there are none.
     """
     manifest = read_manifest(folder)
     for name, there, needed in (
@@ -85,8 +84,7 @@ def prepare(
 ) -> Prepared:
     """Read the scenes and make the network.
 
-    Raises:
-        ModelError: the scenes are of another sensor, or something is missing.
+    Raises ModelError where the scenes are of another sensor, or something is missing.
     """
     check_scenes(folder, description)
     torch.manual_seed(seed)
@@ -107,8 +105,7 @@ def prepare(
 def export_trained(prepared: Prepared, training: Training, path: Path) -> None:
     """Write the averaged network as an ONNX file.
 
-    Raises:
-        ModelError: the file cannot be written.
+    Raises ModelError where the file cannot be written.
     """
     trained = f"{len(training.history)} epochs, {prepared.objective.scenes} scenes"
     example = {"data": torch.zeros(1, prepared.network.inputs)}

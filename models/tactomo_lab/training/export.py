@@ -33,8 +33,7 @@ def export(
 ) -> None:
     """Write a network, its weights in half precision; it computes in single precision.
 
-    Raises:
-        ModelError: the file cannot be written.
+    Raises ModelError where the file cannot be written.
     """
     network.eval()
     buffer = io.BytesIO()
@@ -76,23 +75,14 @@ def halved(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def notes_of(
-    kind: str,
-    description: SensorDescription,
-    channels: tuple[Channel, ...],
-    scale: float,
-    bases: Mapping[Channel, FloatArray],
-    **further: str,
+    kind: str,  # of network
+    description: SensorDescription,  # the sensor
+    channels: tuple[Channel, ...],  # channels it is given
+    scale: float,  # relative conductivity change that counts as 1 inside
+    bases: Mapping[Channel, FloatArray],  # (M, K) of the prefilter of each channel
+    **further: str,  # whatever else is worth knowing
 ) -> dict[str, str]:
-    """What a network's file says of itself.
-
-    Args:
-        kind: of network.
-        description: the sensor.
-        channels: channels it is given.
-        scale: relative conductivity change that counts as 1 inside.
-        bases: (M, K) of the prefilter of each channel.
-        further: whatever else is worth knowing.
-    """
+    """What a network's file says of itself."""
     notes = {
         "format": str(FORMAT),
         "kind": kind,

@@ -52,14 +52,12 @@ class FusionObjective:
         return found
 
 
-def image_loss(made: tuple[Tensor, Tensor, Tensor], true: Tensor, pressed: Tensor) -> Tensor:
-    """RIE squared of the map, cross entropy of the shape, and of the confidence.
-
-    Args:
-        made: `FusionNetwork.raw` of n scenes.
-        true: (n, rows, columns) maps over the network's scale.
-        pressed: (n, rows, columns) shapes.
-    """
+def image_loss(
+    made: tuple[Tensor, Tensor, Tensor],  # `FusionNetwork.raw` of n scenes
+    true: Tensor,  # (n, rows, columns) maps over the network's scale
+    pressed: Tensor,  # (n, rows, columns) shapes
+) -> Tensor:
+    """RIE squared of the map, cross entropy of the shape, and of the confidence."""
     size, shape, trust = (part.float() for part in made)
     weight = 1 / ((true**2).sum((1, 2)) + MIN_CHANGE)
     of_map = (((size - true) ** 2).sum((1, 2)) * weight).mean()

@@ -22,36 +22,25 @@ AVERAGED = 0.998  # of the averaged weights that each step keeps
 
 @dataclass(frozen=True)
 class Epoch:
-    """What one epoch came to.
+    """What one epoch came to."""
 
-    Attributes:
-        loss: mean over its batches.
-        held_out: correlation of the maps of scenes that are not trained on, by noise in dB and
-            number of contacts.
-    """
-
-    loss: float
+    loss: float  # mean over its batches
+    # correlation of the maps of scenes that are not trained on, by noise in dB and number of
+    # contacts
     held_out: dict[str, float]
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How long and how fast.
+    """How long and how fast."""
 
-    Attributes:
-        epochs: passes over the scenes.
-        batch: scenes in a step.
-        rate: highest learning rate; it rises over a twentieth of the steps and falls by a cosine.
-        seed: of the order, the noise and the turns.
-        half: compute products in bfloat16, twice as fast where the processor has it.
-    """
-
-    epochs: int
-    batch: int = 128
+    epochs: int  # passes over the scenes
+    batch: int = 128  # scenes in a step
+    # highest learning rate; it rises over a twentieth of the steps and falls by a cosine
     rate: float = 2e-3
     weight_decay: float = 1e-2
-    seed: int = 0
-    half: bool = True
+    seed: int = 0  # of the order, the noise and the turns
+    half: bool = True  # compute products in bfloat16, twice as fast where the processor has it
     device: str = "cpu"
 
 
@@ -76,8 +65,7 @@ class Training:
 def use(device: str, threads: int | None = None) -> None:
     """Prepare this process for a device, and for so many threads; PyTorch's choice if None.
 
-    Raises:
-        ModelError: there is no such device.
+    Raises ModelError where there is no such device.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise ModelError("PyTorch finds no GPU here; leave out --device, or use cpu")
@@ -110,8 +98,7 @@ def train(
     Yields:
         Each epoch's outcome.
 
-    Raises:
-        ModelError: a checkpoint cannot be written, or the loss is no number.
+    Raises ModelError where a checkpoint cannot be written, or the loss is no number.
     """
     steps = max(1, objective.scenes // settings.batch)
     for epoch in range(len(training.history), settings.epochs):
@@ -170,8 +157,7 @@ def _rate(highest: float, done: float) -> float:
 def save_checkpoint(training: Training, settings: Settings, path: Path) -> None:
     """Keep a training; a half-written file never takes the place of a whole one.
 
-    Raises:
-        ModelError: the file cannot be written.
+    Raises ModelError where the file cannot be written.
     """
     state = {
         "settings": asdict(settings),
@@ -193,8 +179,7 @@ def save_checkpoint(training: Training, settings: Settings, path: Path) -> None:
 def load_weights(network: nn.Module, checkpoint: Path) -> None:
     """Give a network the averaged weights of another training's checkpoint.
 
-    Raises:
-        ModelError: it is damaged, or of another network.
+    Raises ModelError where it is damaged, or of another network.
     """
     try:
         network.load_state_dict(_read(checkpoint)["averaged"])
@@ -219,8 +204,7 @@ def _damaged(path: Path) -> str:
 def load_checkpoint(training: Training, settings: Settings, path: Path) -> None:
     """Go on from a checkpoint.
 
-    Raises:
-        ModelError: it is damaged, or of other settings or another network.
+    Raises ModelError where it is damaged, or of other settings or another network.
     """
     state = _read(path)
     try:

@@ -82,26 +82,18 @@ class Manifest:
 
 @dataclass(frozen=True)
 class _Sheet:
-    """A solved sheet.
+    """A solved sheet."""
 
-    Attributes:
-        mesh: with electrodes where they really are.
-        conductivity: (T,) of each triangle, relative to the description's.
-        impedance: (L,) of its electrodes, likewise.
-        rest: (M,) volts while nothing presses.
-    """
-
-    mesh: SheetMesh
-    conductivity: FloatArray
-    impedance: FloatArray
-    rest: FloatArray
+    mesh: SheetMesh  # with electrodes where they really are
+    conductivity: FloatArray  # (T,) of each triangle, relative to the description's
+    impedance: FloatArray  # (L,) of its electrodes, likewise
+    rest: FloatArray  # (M,) volts while nothing presses
 
 
 class SceneSimulator:
     """Simulates training scenes of one sensor.
 
-    Raises:
-        DataError: it has no magnitude channel.
+    Raises DataError where it has no magnitude channel.
     """
 
     def __init__(self, description: SensorDescription) -> None:
@@ -288,8 +280,7 @@ def _manifest(description: SensorDescription, seed: int, scenes: int) -> Manifes
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Say in a folder what its shards are; the number of scenes may change.
 
-    Raises:
-        ModelError: it holds something else, or cannot be written.
+    Raises ModelError where it holds something else, or cannot be written.
     """
     path = folder / MANIFEST
     if path.exists():
@@ -313,8 +304,7 @@ def _differences(old: Manifest, new: Manifest) -> Iterator[tuple[str, str, str]]
 def read_manifest(folder: Path) -> Manifest:
     """Read what a folder of shards holds.
 
-    Raises:
-        ModelError: there is none, or it is damaged.
+    Raises ModelError where there is none, or it is damaged.
     """
     path = folder / MANIFEST
     try:
@@ -335,8 +325,7 @@ def read_scenes(folder: Path) -> dict[str, Any]:
     Returns:
         The arrays of `SceneSimulator.simulate`, each with a first axis of scenes.
 
-    Raises:
-        ModelError: the folder holds none, is not complete, or a file is damaged.
+    Raises ModelError where the folder holds none, is not complete, or a file is damaged.
     """
     shards = [
         read_shard(shard_path(folder, first), size)

@@ -117,16 +117,14 @@ class SheetEstimator:
         self._around = [np.flatnonzero(nearest == k) for k in range(len(centres))]
 
     def estimate(
-        self, voltages: FloatArray, usable: BoolArray, noise: FloatArray
+        self,
+        voltages: FloatArray,  # (M,) of the unpressed sheet, volts on any scale
+        usable: BoolArray,  # (M,) which of them count
+        noise: FloatArray,  # (M,) their relative standard deviations
     ) -> ForwardModel | None:
         """The model of the sheet that these voltages are of.
 
         None where none explains them, or where the sheet is too large for a model of its own.
-
-        Args:
-            voltages: (M,) of the unpressed sheet, volts on any scale.
-            usable: (M,) which of them count.
-            noise: (M,) their relative standard deviations.
         """
         if len(self._even.support) > MAX_NODES:
             return None

@@ -121,8 +121,7 @@ def default_path(description: SensorDescription) -> Path:
 def save_artifact(artifact: Artifact, path: Path) -> None:
     """Write an artifact; a half-written one is never left under that name.
 
-    Raises:
-        ArtifactError: the file cannot be written.
+    Raises ArtifactError where the file cannot be written.
     """
     weights = artifact.bare.map_weights.tocsr()
     assert isinstance(artifact.bare.green, PackedGreensFunction)

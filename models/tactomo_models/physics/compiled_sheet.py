@@ -101,18 +101,13 @@ class CompiledResponse:
 
 
 class CompiledData:
-    """Relative changes that were measured, and how they are weighted; see `Changes`.
-
-    Args:
-        change: (M,).
-        weight: (M,) inverse standard deviations.
-        drift: (M, K) directions and (K,) shares that are taken off along them; None without.
-    """
+    """Relative changes that were measured, and how they are weighted; see `Changes`."""
 
     def __init__(
         self,
-        change: FloatArray,
-        weight: FloatArray,
+        change: FloatArray,  # (M,)
+        weight: FloatArray,  # (M,) inverse standard deviations
+        # (M, K) directions and (K,) shares that are taken off along them; None without
         drift: tuple[FloatArray, FloatArray] | None,
     ) -> None:
         along, share = (np.zeros((len(change), 0)), np.zeros(0)) if drift is None else drift
@@ -136,30 +131,26 @@ class Pressed:
 
 
 class CompiledAreas:
-    """Areas that are pressed: what a solve needs of them, however strongly they are.
-
-    Attributes:
-        where: (p,) pressable nodes that they are around.
-        found: the same for C.
-        nodes: (n,) positions of their nodes in `BareSheet.support`.
-        rim: (r,) positions of those on rims.
-    """
+    """Areas that are pressed: what a solve needs of them, however strongly they are."""
 
     def __init__(self, sheet: _Sheet, where: IntArray) -> None:
-        self.where = where
+        self.where = where  # (p,) pressable nodes that they are around
         most = min(sheet.triangles, len(where) * sheet.most_around)
         nodes = min(sheet.support, 3 * most)
         sizes = np.array([most, 3 * most, nodes, nodes + 1, nodes, nodes])
         self._kept = np.empty(sizes.sum(), np.int64)
         starts = (sizes.cumsum() - sizes).tolist()
         place = address(self._kept)
+        # the same for C
         self.found = _Areas(0, 0, 0, 0, 0, *(place + 8 * start for start in starts))
         _check(
             LIBRARY.find_areas(ctypes.byref(sheet), len(where), at(where), ctypes.byref(self.found))
         )
         rim = self.found.rim
         count = self.found.nodes
+        # (n,) positions of their nodes in `BareSheet.support`
         self.nodes = self._kept[starts[2] : starts[2] + count]
+        # (r,) positions of those on rims
         self.rim = self.nodes[self._kept[starts[4] : starts[4] + count] == 0]
         width = rim + sheet.fields
         self._known = np.empty(rim * (width + rim))
@@ -192,8 +183,7 @@ class CompiledSheet:
         bare: the sheet.
         arrays: what is known of its triangles, nodes and electrode pairs, as in `inner_loop.c`.
 
-    Raises:
-        ModelError: the compiled library is not there, or not of this machine.
+    Raises ModelError where the compiled library is not there, or not of this machine.
     """
 
     def __init__(
@@ -242,27 +232,19 @@ class CompiledSheet:
 
     def solve(
         self,
-        areas: CompiledAreas,
-        pressed: Pressed | None,
-        data: CompiledData | None,
-        change: FloatArray | None = None,
+        areas: CompiledAreas,  # around it
+        pressed: Pressed | None,  # what presses; None where `change` is given
+        data: CompiledData | None,  # what was measured; None where nothing is compared
+        change: FloatArray | None = None,  # (P,) conductivity minus the bare sheet's
         *,
-        mix_resistivities: bool = False,
+        mix_resistivities: bool = False,  # see `ForwardModel.solve`
     ) -> tuple[Solution, FloatArray]:
         """Solve for what is pressed, and compare it with data.
-
-        Args:
-            areas: around it.
-            pressed: what presses; None where `change` is given.
-            data: what was measured; None where nothing is compared.
-            change: (P,) conductivity minus the bare sheet's.
-            mix_resistivities: see `ForwardModel.solve`.
 
         Returns:
             The solution, and the weighted residual (M,) of the data.
 
-        Raises:
-            numpy.linalg.LinAlgError: a conductivity is not above 0.
+        Raises numpy.linalg.LinAlgError where a conductivity is not above 0.
         """
         found, sheet = areas.found, self._sheet
         sizes = (sheet.pressable, sheet.voltages, sheet.voltages, found.nodes * sheet.fields)
@@ -300,25 +282,15 @@ class CompiledSheet:
 
     def slopes(
         self,
-        areas: CompiledAreas,
-        solution: Solution,
-        potentials: FloatArray,
-        pressed: Pressed,
-        data: CompiledData,
-        by_share: FloatArray,
-        by_pressure: FloatArray,
+        areas: CompiledAreas,  # around what is pressed
+        solution: Solution,  # its solution
+        potentials: FloatArray,  # (n, L - 1) at the areas' nodes
+        pressed: Pressed,  # what presses
+        data: CompiledData,  # what was measured
+        by_share: FloatArray,  # (p, N) derivatives of the shares by the parameters
+        by_pressure: FloatArray,  # (p, N) those of the pressures
     ) -> FloatArray:
-        """Derivative (M, N + 1) of the weighted residual by N parameters and the log ratio.
-
-        Args:
-            areas: around what is pressed.
-            solution: its solution.
-            potentials: (n, L - 1) at the areas' nodes.
-            pressed: what presses.
-            data: what was measured.
-            by_share: (p, N) derivatives of the shares by the parameters.
-            by_pressure: (p, N) those of the pressures.
-        """
+        """Derivative (M, N + 1) of the weighted residual by N parameters and the log ratio."""
         pressing = _pressing(pressed, areas.where, solution.mixes_resistivities)
         pressing.change, pressing.potentials = address(solution.change), address(potentials)
         jacobian = np.empty((self._sheet.voltages, by_share.shape[1] + 1))

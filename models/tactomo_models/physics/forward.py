@@ -165,8 +165,7 @@ class ForwardModel:
                 the contrast (to 0.3 mm of 3 mm triangles; otherwise it is off by up to 0.9 mm).
                 Triangles with a corner that conducts worse than the sheet mix conductivities.
 
-        Raises:
-            numpy.linalg.LinAlgError: a conductivity is not above 0.
+        Raises numpy.linalg.LinAlgError where a conductivity is not above 0.
         """
         areas = self._compiled.areas(np.flatnonzero(change))
         return self._compiled.solve(areas, None, None, change, mix_resistivities=mix_resistivities)[
@@ -183,27 +182,19 @@ class ForwardModel:
         Returns:
             The solution, and the weighted residual (M,) of the data.
 
-        Raises:
-            numpy.linalg.LinAlgError: a conductivity is not above 0.
+        Raises numpy.linalg.LinAlgError where a conductivity is not above 0.
         """
         return self._compiled.solve(self._compiled.areas(pressed.where), pressed, data)
 
     def slopes(
         self,
-        solution: Solution,
-        pressed: Pressed,
-        data: CompiledData,
-        by_share: FloatArray,
-        by_pressure: FloatArray,
+        solution: Solution,  # that of `evaluate`
+        pressed: Pressed,  # what presses on p nodes
+        data: CompiledData,  # what was measured
+        by_share: FloatArray,  # (p, N) derivatives of the shares by N parameters
+        by_pressure: FloatArray,  # (p, N) those of the pressures
     ) -> FloatArray:
         """Derivative of the weighted residual of what is pressed.
-
-        Args:
-            solution: that of `evaluate`.
-            pressed: what presses on p nodes.
-            data: what was measured.
-            by_share: (p, N) derivatives of the shares by N parameters.
-            by_pressure: (p, N) those of the pressures.
 
         Returns:
             (M, N + 1), by the parameters and the log ratio.

@@ -82,13 +82,11 @@ def is_noise(squares: FloatArray, freedom: float = np.inf) -> bool:
 
 
 @cache
-def noise_limit(count: float, freedom: float = np.inf) -> float:
-    """Sum of squares over their variance that noise alone stays below, but for false alarms.
-
-    Args:
-        count: voltages, or degrees of freedom that they have.
-        freedom: degrees of freedom that their variance is known with.
-    """
+def noise_limit(
+    count: float,  # voltages, or degrees of freedom that they have
+    freedom: float = np.inf,  # degrees of freedom that their variance is known with
+) -> float:
+    """Sum of squares over their variance that noise alone stays below, but for false alarms."""
     if np.isinf(freedom):
         return float(chdtri(count, FALSE_ALARM))
     return count * float(fdtri(count, freedom, 1 - FALSE_ALARM))

@@ -204,8 +204,7 @@ class ChannelTare:
             creep: (M,) the part of it in which a touch may be hidden.
             saturated: whether its converter clipped.
 
-        Raises:
-            DataError: it has another number of voltages than the sensor.
+        Raises DataError where it has another number of voltages than the sensor.
         """
         still_share = 0.01  # of the model error's variance, that a still scene may change by
         median_square = 0.455  # of a normal distribution of unit variance

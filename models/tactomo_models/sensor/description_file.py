@@ -45,9 +45,8 @@ def shipped_text(name: str) -> str:
 def load_description(source: str | Path) -> SensorDescription:
     """Read a sensor description by its shipped name or from a TOML file.
 
-    Raises:
-        DescriptionError: the file cannot be read, is not TOML, or a key is unknown, missing
-            or out of range; the message names the key, its value and what is allowed.
+    Raises DescriptionError where the file cannot be read, is not TOML, or a key is unknown, missing
+    or out of range; the message names the key, its value and what is allowed.
     """
     name = str(source)
     with _explained(name):

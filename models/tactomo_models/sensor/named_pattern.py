@@ -44,8 +44,7 @@ class NamedPattern(NamedTuple):
     def of_name(cls, name: str) -> Self:
         """Read a pattern's name.
 
-        Raises:
-            DataError: it is none.
+        Raises DataError where it is none.
         """
         count, *offsets = name.lower().split(":")
         rotated = offsets[-1:] == [ROTATED]
@@ -89,8 +88,7 @@ class NamedPattern(NamedTuple):
     def applied(self, description: SensorDescription) -> SensorDescription:
         """The sensor with this pattern; other electrodes cover the share of the rim that its do.
 
-        Raises:
-            DescriptionError: there can be no such sensor.
+        Raises DescriptionError where there can be no such sensor.
         """
         raw = description.model_dump(by_alias=True, exclude_none=True)
         now, electrodes = description.electrode_count, raw["electrodes"]

@@ -163,8 +163,7 @@ def polygon_outline(
 def uncrossed(key: str, corners: tuple[tuple[float, float], ...]) -> shapely.Polygon:
     """The polygon of corners.
 
-    Raises:
-        ValueError: it crosses or touches itself.
+    Raises ValueError where it crosses or touches itself.
     """
     ring = shapely.Polygon(corners)
     if not ring.is_valid:

@@ -21,17 +21,11 @@ ON_EDGE: Final = 1e-6
 
 @dataclass(frozen=True)
 class Triangles:
-    """Triangles in space and, corner by corner, on the sheet.
+    """Triangles in space and, corner by corner, on the sheet."""
 
-    Attributes:
-        corners_m: (T, 3, 3) points.
-        sheet_m: (T, 3, 2) places on the sheet.
-        normals: (T, 3, 3) unit normals at the corners, out of the pressed side.
-    """
-
-    corners_m: FloatArray
-    sheet_m: FloatArray
-    normals: FloatArray
+    corners_m: FloatArray  # (T, 3, 3) points
+    sheet_m: FloatArray  # (T, 3, 2) places on the sheet
+    normals: FloatArray  # (T, 3, 3) unit normals at the corners, out of the pressed side
 
     @cached_property
     def _to_barycentric(self) -> FloatArray:
@@ -96,9 +90,8 @@ def _edges(corners: FloatArray) -> FloatArray:
 def read_obj(text: str, name: str) -> Triangles:
     """Return the triangles of an OBJ file's text; polygons are cut into fans.
 
-    Raises:
-        ValueError: it has no triangles, or one without texture coordinates, or without an area in
-            space or on the sheet; says where, and what to do.
+    Raises ValueError where it has no triangles, or one without texture coordinates, or without an
+    area in space or on the sheet; says where, and what to do.
     """
     points: list[list[float]] = []
     places: list[list[float]] = []
