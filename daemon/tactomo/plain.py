@@ -1,4 +1,4 @@
-"""Text of others, such as names of devices, made fit for a terminal and a log."""
+"""Text for a terminal and a log: that of others made harmless, and counts in words."""
 
 from __future__ import annotations
 
@@ -14,3 +14,8 @@ _OBEYED: Final = re.compile(
 def plain(text: object) -> str:
     """Return text with nothing in it that a terminal would obey: each such character is a �."""
     return _OBEYED.sub("\N{REPLACEMENT CHARACTER}", str(text))
+
+
+def counted(count: int, noun: str) -> str:
+    """Return "1 contact", "2 contacts" and so on."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -37,5 +37,5 @@ def test_the_page_can_be_followed_in_order(tmp_path: Path) -> None:
     assert "nothing pressed" in said["watch"]
     assert "new reference from 20 dual scans" in said["tare"]
     assert "healthy" in said["doctor"]
-    assert "1 contact(s)" in said["plot grasp.mcap"]
+    assert "1 contact in" in said["plot grasp.mcap"]
     assert (tmp_path / "contacts.csv").read_text().count("\n") > 10

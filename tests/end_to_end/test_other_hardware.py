@@ -43,7 +43,7 @@ def test_a_researcher_with_a_sciospec_and_no_instrument_yet(newcomer: Newcomer) 
     _, status, _, info, plot = newcomer.follow(then)
     assert "sciospec" in status
     assert "sciospec, protocol sciospec" in info
-    assert "1 contact(s)" in plot
+    assert "1 contact in" in plot
     port = request("status", newcomer.addresses["control"], PATIENCE_S)["ports"][0]
     assert (port["state"], port["protocol"]) == ("running", "sciospec")
 

@@ -65,6 +65,12 @@ def is_path(url: str) -> bool:
     return "://" not in url
 
 
+def require_present(url: str) -> None:
+    """Raise PortAbsentError where a path does not exist: known before anything is built."""
+    if is_path(url) and not os.path.exists(url):
+        raise _absent(url)
+
+
 def other_holders(url: str, root: Path = adapters.ROOT) -> list[adapters.Holder]:
     """Return the other processes that use the port, as far as this user may see."""
     found = adapters.holders(url, root) if is_path(url) else []
@@ -117,15 +123,18 @@ def _explain(url: str, baud: int, error: Exception) -> PortError:
     if number in (errno.EAGAIN, errno.EBUSY):
         return _busy(url, adapters.holders(url))
     if number == errno.ENOENT:
-        return PortAbsentError(
-            f"{url} does not exist",
-            "connect the device; `tactomo ports` shows those that are there",
-        )
+        return _absent(url)
     if number in (errno.EACCES, errno.EPERM):
         return PortError(f"{url} may not be opened by this user", how_to_grant(url))
     if not is_path(url) or number is not None or Path(url).is_char_device():
         return PortError(f"cannot open {url} at {baud} baud: {error}", "check port and baud rate")
     return PortError(f"{url} is not a serial device", "give a path such as /dev/ttyACM0")
+
+
+def _absent(url: str) -> PortAbsentError:
+    return PortAbsentError(
+        f"{url} does not exist", "connect the device; `tactomo ports` shows those that are there"
+    )
 
 
 def _busy(url: str, by: list[adapters.Holder]) -> PortBusyError:

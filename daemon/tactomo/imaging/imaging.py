@@ -40,6 +40,7 @@ from tactomo.imaging.kept_reference import KeptReference, KnownSkin
 from tactomo.imaging.method_in_force import Effort, MethodInForce
 from tactomo.imaging.processor_share import ProcessorShare
 from tactomo.imaging.tare import Taring
+from tactomo.plain import counted
 from tactomo.recordings.recorder import Recorder
 from tactomo.scans import DualScan, Mark, Timing, Volts
 from tactomo.stream.publisher import Publisher
@@ -189,7 +190,7 @@ class Imaging:
         if contacts:
             self._on_event(
                 "reference_disputed",
-                f"the reference was taken while {contacts} contact(s) were shown",
+                f"the reference was taken, and shown meanwhile: {counted(contacts, 'contact')}",
                 "take everything off the skin; if contacts are still shown then: `tactomo tare`",
             )
         elif self._kept is not None and self._doubt is None:

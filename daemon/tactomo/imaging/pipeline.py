@@ -28,6 +28,7 @@ from tactomo.acquisition.wall_clock import WallClock
 from tactomo.errors import CommandError
 from tactomo.events import OnEvent, RateLimit, times
 from tactomo.imaging.imaging import Imaging
+from tactomo.plain import counted
 from tactomo.recordings.replay import Replay, ReplayClock
 from tactomo.scans import Delivery, DualScan
 from tactomo.timing import Rate, wall_clock_ns
@@ -369,7 +370,7 @@ class Pipeline(Worker):
         if self.dropped > self._dropped_seen:
             self._on_event(
                 "scans_dropped",
-                f"{self.dropped} dual scans left out since the start",
+                f"{counted(self.dropped, 'dual scan')} left out since the start",
                 "give the daemon more of the processor, or set a faster method or a budget",
             )
         self._dropped_seen = self.dropped

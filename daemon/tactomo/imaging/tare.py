@@ -28,6 +28,7 @@ from tactomo_protocol import Channel
 from tactomo.errors import CommandError
 from tactomo.events import OnEvent
 from tactomo.memory import trim_memory
+from tactomo.plain import counted
 from tactomo.timing import Rate
 
 MOVEMENT_LIMIT: Final = 1e-3
@@ -177,7 +178,7 @@ class Taring:
         trim_memory()
         if not is_new:
             return
-        shown = f", while {contacts} contact(s) were shown" if contacts else ""
+        shown = f"; shown meanwhile: {counted(contacts, 'contact')}" if contacts else ""
         self._on_event("tared", f"{known.reference.scans} dual scans{shown}")
         for answer in tare.answers:  # when all is in force: a status asked for now shows it
             answer.set_result({"scans": known.reference.scans, "contacts": contacts})

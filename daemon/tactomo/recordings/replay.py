@@ -10,6 +10,7 @@ from tactomo_models import Reference, SensorDescription
 from tactomo_models.calibration.calibration_file import PressureCalibration
 
 from tactomo.errors import ConfigError, PortError
+from tactomo.plain import counted
 from tactomo.recordings.playback import Playback
 from tactomo.recordings.recording import (
     REPLAY_SCHEME,
@@ -156,9 +157,10 @@ def parse_replay_url(url: str) -> tuple[Recording, int, float]:
             f"use {REPLAY_SCHEME}:///absolute/path.mcap?port=0&speed=1",
         ) from error
     recording = open_replayable(unquote(parts.netloc + parts.path))
-    if not 0 <= port < len(recording.origin.ports):
+    ports = len(recording.origin.ports)
+    if not 0 <= port < ports:
         raise PortError(
-            f"{url}: the recording has {len(recording.origin.ports)} port(s), numbered from 0",
+            f"{url}: the recording has {counted(ports, 'port')}, numbered from 0",
             "`tactomo info` shows what is in it",
         )
     return recording, port, speed

@@ -62,6 +62,7 @@ from tactomo_models.sensor.description_file import carried_text
 from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
+from tactomo.acquisition.open_serial import require_present
 from tactomo.acquisition.port import PortReader
 from tactomo.config import DaemonConfig
 from tactomo.ending import at_end
@@ -108,6 +109,7 @@ class Daemon:
     Raises:
         ModelError: the description or the artifact cannot be used.
         ConfigError: the ports are not all live, or not all of one recording.
+        PortAbsentError: a port does not exist and `wait_for_ports` is off.
         KeysError: the secret key cannot be used.
         RecordingError, PortError: a replay URL leads to no recording.
     """
@@ -127,6 +129,8 @@ class Daemon:
         # what the sensor is made of, where a recording carries that; by default as configured
         description: SensorDescription | None = None,
     ) -> None:
+        for url in () if config.wait_for_ports else config.ports:
+            require_present(url)
         self.config = config
         self.session = uuid.uuid4().hex  # identity of this run, as in every message
         self._undo = contextlib.ExitStack()
@@ -277,6 +281,12 @@ class Daemon:
             control=self.control_address,
             ports=list(self.config.ports),
         )
+        if self._replay is None:
+            log.info(
+                "taring",
+                detail=f"the first {self.config.tare_scans} dual scans become the reference",
+                next_step="leave the skin alone until `tared`",
+            )
         for why in self._unused:
             self._on_event("calibration_refused", why, "until then no calibration is used")
 

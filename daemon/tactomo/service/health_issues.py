@@ -10,6 +10,8 @@ from typing import Any
 
 from tactomo_client.schema import HealthIssue
 
+from tactomo.plain import counted
+
 CORRUPT_NOTED = 1e-3  # share of packets: a line that loses one now and then still serves
 DROPPED_NOTED = 1e-2  # share of the dual scans
 FEWEST_INCOMPLETE = 3  # fewer are no rate: one of the first 41 says little of the next thousand
@@ -180,7 +182,7 @@ def _of_losses(status: Mapping[str, Any]) -> Iterator[HealthIssue]:
     recent = status.get("last_minute") or {}
     dropped, incomplete = recent.get("dropped_scans") or 0, recent.get("incomplete_scans") or 0
     came = (recent.get("frames") or 0) + dropped
-    of = f"of {came} dual scans within the last minute"
+    of = f"of {counted(came, 'dual scan')} within the last minute"
     is_busy = dropped > DROPPED_NOTED * came
     if is_busy:
         yield HealthIssue("warning", f"{dropped} {of} were left out", FASTER)

@@ -31,6 +31,7 @@ from threadpoolctl import threadpool_limits
 from tactomo.config import Endpoint
 from tactomo.endpoint import is_local
 from tactomo.errors import CommandError, ConfigError
+from tactomo.plain import counted
 from tactomo.protocols import NATIVE, check_scan_fits, emulator_of, find_protocol
 from tactomo.stream.commands import Nothing, explained
 from tactomo.twin.companions import SimulatedCompanions
@@ -116,7 +117,8 @@ class TwinConfig:
         channels = len(self.description.channels)
         if self.ports not in (1, 2) or self.ports > channels:
             raise ConfigError(
-                f"{self.description.name} has {channels} channel(s), so not {self.ports} ports",
+                f"{self.description.name} has {counted(channels, 'channel')}, "
+                f"so not {self.ports} ports",
                 "give 1 port, or 2 for a sensor of two channels",
             )
         if self.protocol != NATIVE:

@@ -170,7 +170,7 @@ def test_a_daemon_that_was_restarted_begins_anew(tactomo: Run, tmp_path: Path) -
     times = sorted({float(row["time_s"]) for row in rows_of(tmp_path / "two.csv")})
     np.testing.assert_allclose(times, np.arange(FRAMES) * PERIOD_NS * 1e-9)
     result = tactomo("plot", "two.mcap", "-o", "two.svg", "--what", "path")
-    assert "wrote two.svg: 4 contact(s)" in result.stdout  # 1 and 2, then 1' and 2'
+    assert "wrote two.svg: 4 contacts" in result.stdout  # 1 and 2, then 1' and 2'
 
 
 def test_a_cut_recording_gives_what_is_there_and_says_so(tactomo: Run, grasp: Path) -> None:

@@ -44,7 +44,7 @@ def test_a_page_of_each_kind(
 ) -> None:
     result = tactomo("plot", grasp, "-o", name, *options)
     assert result.returncode == 0, result.stderr
-    assert result.stdout == f"wrote {name}: 2 contact(s) in 78 frames, 4.0 s\n"
+    assert result.stdout == f"wrote {name}: 2 contacts in 78 frames, 4.0 s\n"
     data = grasp.with_name(name).read_bytes()
     assert data.startswith({"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF"}[name[-3:]])
     if name.endswith("png"):
@@ -103,14 +103,14 @@ def test_some_panels_of_some_seconds(tactomo: Run, grasp: Path) -> None:
         *("--from", 1, "--to", 2),
     )
     assert result.returncode == 0, result.stderr
-    assert "1 contact(s) in 20 frames" in result.stdout
+    assert "1 contact in 20 frames" in result.stdout
 
 
 def test_nothing_pressed_is_a_page_too(tactomo: Run, tmp_path: Path) -> None:
     path = write_grasp(tmp_path / "idle.mcap", range(10, 18))
     result = tactomo("plot", path, "-o", "idle.png")
     assert result.returncode == 0, result.stderr
-    assert "0 contact(s) in 8 frames" in result.stdout
+    assert "0 contacts in 8 frames" in result.stdout
 
 
 @pytest.mark.parametrize(

@@ -132,6 +132,7 @@ def twin_command() -> Any:
         (["twin", "--description", "tank_disc", "--ports", "2"], "1 channel"),
         (["twin", "--twin-control", "tcp://0.0.0.0:5562"], "other computers"),
         (["daemon"], "ports is missing"),
+        (["daemon", "--port", "none"], "none does not exist; connect the device"),
         (["daemon", "--port", "/dev/null", "--set", "tare_scans=1"], "tare_scans = 1"),
         (["replay", "none.mcap", "--viewer"], "cannot open the recording none.mcap"),
         (["viewer", "--address", "nowhere"], "nowhere"),

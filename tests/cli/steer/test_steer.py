@@ -71,10 +71,20 @@ def test_status_shows_what_matters(tactomo: Run, control: Any) -> None:
     result = tactomo("status")
     assert result.returncode == 0
     for words in (
-        *("left_forearm: running", "/dev/ttyACM0 (running)", "300 corrupt", "no hello yet"),
-        *("p50 4.25 ms", "structure_missing", "19.96 frames/s", "2 dual scans dropped"),
+        *(
+            "left_forearm: running",
+            "/dev/ttyACM0 (running)",
+            "300 corrupt",
+            "no device has answered yet",
+        ),
+        *(
+            "p50 4.25 ms",
+            "structure_missing: no scans of the structure channel",
+            "19.96 frames/s",
+            "2 dual scans dropped",
+        ),
         *("20 dual scans", "/tmp/a.mcap (2.5 MB)", "auto; the newest frame by levelset"),
-        *("refused: [neither] contact nor drift", "magnitude -1.23%, unevenly 0.09%"),
+        *("refused: [neither] contact nor drift", "magnitude drifted by -1.23%, unevenly by 0.09%"),
         "12 ms: fit, 4.50 modelled ms; machine speed: measured here",
     ):
         assert words in result.stdout
@@ -124,8 +134,8 @@ def test_status_begins_with_what_is_wrong_and_what_to_do(tactomo: Run, control: 
         "/dev/ttyACM0: 3 of 102 packets came damaged within the last minute",
         "check the cable, its shield and the baud rate",
     ]
-    assert "port_lost, 4 min ago: gone" in result.stdout
-    assert "port_lost 2, tared 1" in result.stdout
+    assert "port lost, 4 min ago: gone" in result.stdout
+    assert "port lost 2 times, tared once" in result.stdout
     assert "pid 7, 10.0 % of a core on average, 90.0 MB, 6 threads" in result.stdout
 
 
@@ -147,7 +157,7 @@ def test_what_is_lost_is_told_by_counts_of_the_last_minute(tactomo: Run, control
     judge(control)
     shown = tactomo("status").stdout
     assert "left out" not in shown
-    assert "since the start 7058 dual scans dropped" in shown
+    assert "7058 dual scans dropped" in shown
 
 
 def test_before_the_first_tare_it_says_that_one_is_being_taken(tactomo: Run, control: Any) -> None:
@@ -169,6 +179,14 @@ def test_status_prints_what_the_daemon_finds_and_judges_nothing_itself(
     assert shown.splitlines()[:3] == ["it hums", "    oil it", "left_forearm: stale"]
 
 
+def test_flags_and_counts_are_told_in_words(tactomo: Run, control: Any) -> None:
+    told = {"flags": ["no_reference", "of_tomorrow"], "dropped_scans": 1, "incomplete_scans": 0}
+    control.answers["status"] = {**STATUS, **told, "frames": 1}
+    shown = tactomo("status").stdout
+    assert "no_reference: not tared yet; of_tomorrow" in shown
+    assert "1 dual scan dropped and 0 incomplete since the start, 1 frame made" in shown
+
+
 def test_every_flag_has_its_advice() -> None:
     assert set(FLAG_ADVICE) == {flag.name.lower() for flag in Flag if flag.name}
 
@@ -179,7 +197,8 @@ def test_status_as_json_and_of_a_daemon_that_has_no_data_yet(tactomo: Run, contr
     control.answers["status"] = NEW_DAEMON
     result = tactomo("status")
     assert result.returncode == 0
-    assert "waiting_for_data" in result.stdout
+    assert "left_forearm: waiting for data" in result.stdout
+    assert "unknown: no map yet" in result.stdout
 
 
 @pytest.mark.slow
@@ -208,7 +227,7 @@ def test_status_of_one_sensor_is_what_its_stream_tells(tactomo: Run) -> None:
     [
         ({}, {}, ""),
         ({"reference": None, "rates": {"frames_hz": 0.25}}, {}, "80 s"),
-        ({}, {"contacts": 2}, "2 contact(s) were shown meanwhile"),
+        ({}, {"contacts": 2}, "shown meanwhile: 2 contacts, which now count as nothing pressed"),
         ({}, {"contacts": 2}, "tare again"),
     ],
 )

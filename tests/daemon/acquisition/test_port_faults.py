@@ -28,12 +28,16 @@ def refusal(port: str | Path) -> PortError:
     config = load_config(
         None, ports=[str(port)], stream=local, control=local, baseline={"track": False}
     )
-    daemon = Daemon(config, reconstructor=memory)
-    try:
-        with pytest.raises(PortError) as caught:
+
+    def start() -> None:
+        daemon = Daemon(config, reconstructor=memory)
+        try:
             daemon.start()
-    finally:
-        daemon.stop()
+        finally:
+            daemon.stop()
+
+    with pytest.raises(PortError) as caught:
+        start()
     assert caught.value.next_step
     return caught.value
 

@@ -81,7 +81,8 @@ def test_nothing_is_left_after_a_stop(bench: Start, tmp_path: Path) -> None:
 def test_nothing_is_left_after_a_start_that_failed(bench: Start, tmp_path: Path) -> None:
     b = bench()
     free = os.openpty()
-    good, bad = os.ttyname(free[1]), str(tmp_path / "absent")
+    good, bad = os.ttyname(free[1]), str(tmp_path / "no_port")
+    Path(bad).touch()
     threads = set(threading.enumerate())
     before = len(os.listdir("/proc/self/fd"))
     memory: Any = SimpleNamespace(method="auto", budget_s=None, take=None)
@@ -99,6 +100,13 @@ def test_nothing_is_left_after_a_start_that_failed(bench: Start, tmp_path: Path)
     assert set(threading.enumerate()) <= threads
     for descriptor in free:
         os.close(descriptor)
+
+
+@pytest.mark.slow
+def test_the_log_says_that_the_skin_is_tared(spawn: Start) -> None:
+    process, _ = spawn()
+    wait_until(lambda: process.told("taring"), "taring")
+    assert process.told("taring")[0]["detail"] == "the first 3 dual scans become the reference"
 
 
 def test_a_sensor_of_one_channel_has_one_port() -> None:

@@ -73,7 +73,7 @@ def test_tare_is_answered_when_the_new_reference_holds(bench: Start) -> None:
         b.step(load=0.2)  # the maps go on meanwhile, against the old reference
     asking.join()
     assert answers == [{"scans": 3, "contacts": shown}]
-    b.listener.wait("event", lambda event: f"{shown} contact(s) were shown" in event["detail"])
+    b.listener.wait("event", lambda event: f"shown meanwhile: {shown} contact" in event["detail"])
     frame = b.step(load=0.2)
     assert abs(array_from_wire(frame["map"])).max() < 1e-3
     assert frame["contacts"] == []

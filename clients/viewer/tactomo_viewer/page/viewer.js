@@ -410,7 +410,7 @@ function choose(name, value) {
 
 byId("tare").onclick = () =>
   command("tare", {}, ({ scans, contacts }) => `Tared: the reference is the mean of ${scans} scans.` +
-    (contacts ? ` ${contacts} contact(s) were shown: was something on the skin? Then tare again without it.` : ""));
+    (contacts ? ` Shown meanwhile: ${contacts} contact${contacts === 1 ? "" : "s"}. Was something on the skin? Then tare again without it.` : ""));
 byId("record").onclick = () =>
   state.status?.fields.recording
     ? command("record_stop", {}, ({ path }) => `Recorded to ${path}`)

@@ -21,6 +21,7 @@ from tactomo.cli.options import (
 )
 from tactomo.cli.output import progress_bar, say
 from tactomo.cli.plot.plot import picture_option, prepare_file, save_figure
+from tactomo.plain import counted
 
 app = typer_app()
 
@@ -164,7 +165,10 @@ def reconstruct(
                     taught=lesson,
                 )
             if made.failed:
-                say(f"{made.failure}; {made.failed} frame(s) are tikhonov's instead", err=True)
+                say(
+                    f"{made.failure}; instead, tikhonov made {counted(made.failed, 'frame')}",
+                    err=True,
+                )
             if file == maps:
                 say(f"wrote {maps}: {made.frames} frames")
         if not maps.is_file():  # such as /dev/null

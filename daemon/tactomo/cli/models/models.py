@@ -11,6 +11,7 @@ from tactomo.cli.commands import Group
 from tactomo.cli.models.drawing import app as drawing_app
 from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, examples, typer_app
 from tactomo.cli.output import say
+from tactomo.plain import counted
 
 app = typer_app(
     help="Build and list the models of sensors.", name="models", cls=Group, no_args_is_help=True
@@ -159,7 +160,7 @@ def import_model(
     x_mm, y_mm = 1e3 * sensor.electrode_centres_m[0]
     say(
         f"wrote {path}: {sensor.sheet.shape} of {1e3 * sensor.width_m:.4g} x "
-        f"{1e3 * sensor.height_m:.4g} mm, {len(sensor.sheet.holes_m)} hole(s), "
+        f"{1e3 * sensor.height_m:.4g} mm, {counted(len(sensor.sheet.holes_m), 'hole')}, "
         f"{sensor.electrode_count} electrodes of {1e3 * sensor.electrodes.length_m:.3g} mm"
     )
     if model.pattern is not None and model.pattern.note:

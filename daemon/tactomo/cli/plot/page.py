@@ -15,7 +15,7 @@ from tactomo_client.appearance import COLOURS, map_pixels, shown_image
 from tactomo.cli.files.recorded_frames import Moment
 from tactomo.cli.plot.course import Course, Track
 from tactomo.imaging.frames import description_fields
-from tactomo.plain import plain
+from tactomo.plain import counted, plain
 
 if TYPE_CHECKING:
     from tactomo_models import SensorDescription
@@ -355,8 +355,9 @@ def _draw_timing(axes: Any, course: Course, _: dict[str, Any]) -> None:
     ages = "age unknown: made of the recording"
     if known_ms:
         ages = f"age {np.median(known_ms):.1f} ms (99 %: {np.percentile(known_ms, 99):.1f})"
-    words = f"{rate_hz:.1f} frames/s; {ages}; {sum(course.lost)} frames lost, "
-    words += f"{sum(course.left_out)} dual scans left out"
+    words = f"{rate_hz:.1f} frames/s; {ages}; "
+    words += f"{counted(sum(course.lost), 'frame')} lost, "
+    words += f"{counted(sum(course.left_out), 'dual scan')} left out"
     axes.set_title(words, fontsize=8, loc="right", pad=2, color=INK)
     if known_ms:
         axes.set_yscale("log")

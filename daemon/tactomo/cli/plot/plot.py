@@ -13,6 +13,7 @@ from tactomo.cli.files.recorded_frames import FromOption, ToOption, recorded_fra
 from tactomo.cli.options import Force, RecordedDescription, examples, typer_app
 from tactomo.cli.output import say
 from tactomo.errors import TactomoError, needs, os_errors_as
+from tactomo.plain import counted
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -75,7 +76,8 @@ def plot(
         figure = draw_page(course, maps, frames.description, panels, recording.name)
     save_figure(figure, output, PAGE_DPI)
     say(
-        f"wrote {output}: {len(course.tracks)} contact(s) in {len(course.times_s)} frames, "
+        f"wrote {output}: {counted(len(course.tracks), 'contact')} in "
+        f"{counted(len(course.times_s), 'frame')}, "
         f"{course.times_s[-1] - course.times_s[0]:.1f} s"
     )
 

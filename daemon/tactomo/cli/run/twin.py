@@ -84,7 +84,7 @@ def twin(
         with announced(Running("twin", running.control, ports=paths)):
             for path in paths:
                 say(f"port     {path}")
-            say(f"control  {running.control}")
+            say(f"control  {running.control}, for `tactomo poke`")
             if announce:
                 print_ready({"ports": paths, "control": running.control})
             running.wait()

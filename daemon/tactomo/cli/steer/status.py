@@ -9,7 +9,9 @@ import typer
 from tactomo.cli import options
 from tactomo.cli.output import print_json, say
 from tactomo.cli.sensors import newest_status
-from tactomo.plain import plain
+from tactomo.events import times
+from tactomo.plain import counted, plain
+from tactomo.service.health_issues import FLAG_ADVICE
 
 app = options.typer_app()
 
@@ -42,7 +44,7 @@ def status(
         colour = "red" if issue["severity"] == "error" else "yellow"
         typer.secho(issue["what"], fg=colour, bold=True)
         say(f"    {issue['next_step']}")
-    say(f"{answer['sensor']}: {answer['state']}")
+    say(f"{answer['sensor']}: {_words(answer['state'])}")
     for name, value in _rows(answer):
         typer.echo(f"{typer.style(f'{name:<13} ', bold=True)}{value}")
 
@@ -85,19 +87,17 @@ def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
             "method",
             f"{status.get('tier_requested')}; the newest frame by {status.get('tier') or '-'}",
         ),
-        ("  can be", ", ".join(status.get("methods") or []) or "-"),
+        ("  methods", ", ".join(status.get("methods") or []) or "-"),
         ("budget", _budget(status.get("budget_ms"), status.get("plan") or {})),
-        ("flags", ", ".join(status.get("flags", [])) or "none"),
-        (
-            "misfit",
-            f"{_number(status.get('misfit'))} (1: explained to the noise; too much is flagged)",
-        ),
+        ("flags", "; ".join(map(_flag, status.get("flags", []))) or "none"),
+        ("misfit", _misfit(status.get("misfit"))),
         (
             "lost",
-            f"since the start {status.get('dropped_scans', 0)} dual scans dropped, "
-            f"{status.get('incomplete_scans', 0)} incomplete, of {status.get('frames', 0)} frames",
+            f"{counted(status.get('dropped_scans', 0), 'dual scan')} dropped and "
+            f"{status.get('incomplete_scans', 0)} incomplete since the start, "
+            f"{counted(status.get('frames', 0), 'frame')} made",
         ),
-        ("reference", f"{reference['scans']} dual scans" if reference else "none yet"),
+        ("reference", counted(reference["scans"], "dual scan") if reference else "none yet"),
         ("baseline", _baseline(status.get("baseline") or {})),
         ("recording", f"{recording['path']} ({_mb(recording['bytes'])})" if recording else "off"),
         ("subscribers", str(status.get("subscribers", "-"))),
@@ -126,7 +126,7 @@ def _baseline(baseline: dict[str, Any]) -> str:
     """Say whether the reference follows drift, and how far it has gone since the tare."""
     state, refusal = str(baseline.get("state") or "-"), baseline.get("refusal")
     gone = [
-        f"{channel} {drift['gain']:+.2%}, unevenly {drift['uneven']:.2%}"
+        f"{channel} drifted by {drift['gain']:+.2%}, unevenly by {drift['uneven']:.2%}"
         for channel, drift in (baseline.get("drift") or {}).items()
     ]
     return "; ".join([f"{_warn(state)}: {refusal}" if refusal else state, *gone])
@@ -134,13 +134,14 @@ def _baseline(baseline: dict[str, Any]) -> str:
 
 def _events(events: dict[str, Any]) -> str:
     counts = events.get("counts") or {}
-    return ", ".join(f"{name} {count}" for name, count in sorted(counts.items())) or "none"
+    told = (f"{_words(name)} {times(count)}" for name, count in sorted(counts.items()))
+    return ", ".join(told) or "none"
 
 
 def _trouble(trouble: dict[str, Any]) -> str:
     age_s = trouble.get("age_s") or 0.0
     ago = f"{age_s:.0f} s" if age_s < 120 else f"{age_s / 60:.0f} min"
-    return f"{_warn(trouble.get('name'))}, {ago} ago: {trouble.get('detail')}"
+    return f"{_warn(_words(trouble.get('name')))}, {ago} ago: {trouble.get('detail')}"
 
 
 def _process(process: dict[str, Any], uptime_s: float) -> str:
@@ -158,7 +159,8 @@ def _mb(size_bytes: float | None) -> str:
 def _port_line(port: dict[str, Any]) -> str:
     device = port.get("device") or {}
     return (
-        f"{port.get('url')} ({port.get('state', '-')}), {device.get('device_id', 'no hello yet')}, "
+        f"{port.get('url')} ({port.get('state', '-')}), "
+        f"{device.get('device_id', 'no device has answered yet')}, "
         f"{', '.join(device.get('channels', [])) or '-'}; {port.get('packets', 0)} packets, "
         f"{port.get('corrupt', 0)} corrupt"
     )
@@ -182,6 +184,20 @@ def _percentiles(times: dict[str, Any]) -> str:
 
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
+
+
+def _misfit(misfit: float | None) -> str:
+    if misfit is None:
+        return "unknown: no map yet"
+    return f"{misfit:.2f} times the noise (about 1: the map explains the voltages)"
+
+
+def _flag(name: str) -> str:
+    return f"{name}: {FLAG_ADVICE[name][0]}" if name in FLAG_ADVICE else name
+
+
+def _words(name: object) -> str:
+    return str(name).replace("_", " ")
 
 
 def _warn(text: object) -> str:

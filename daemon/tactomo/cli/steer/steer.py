@@ -13,6 +13,7 @@ from tactomo.cli import options
 from tactomo.cli.output import print_json, say
 from tactomo.cli.sensors import find_control, find_twin
 from tactomo.errors import TactomoError
+from tactomo.plain import counted
 
 if TYPE_CHECKING:
     from tactomo_client import Daemon, RecordedFile
@@ -45,7 +46,8 @@ def tare(
     say(f"new reference from {taken.scans} dual scans")
     if taken.contacts:
         say(
-            f"{taken.contacts} contact(s) were shown meanwhile and now count as nothing pressed; "
+            f"shown meanwhile: {counted(taken.contacts, 'contact')}, which now count as nothing "
+            "pressed; "
             "if something was on the skin, take it off and tare again",
             err=True,
         )
