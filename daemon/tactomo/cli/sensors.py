@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
@@ -111,11 +111,19 @@ def find_twin(address: str | None) -> str:
 
 def twin_of(sensor: Running) -> str | None:
     """Return the control address of the twin that a sensor's ports are of, if they are one's."""
-    ports = {os.path.realpath(port) for port in sensor.ports}
-    for twin in running("twin"):
-        if ports and ports <= {os.path.realpath(port) for port in twin.ports}:
-            return twin.control
-    return None
+    ports = _real(sensor.ports)
+    twins = (twin for twin in running("twin") if ports and ports <= _real(twin.ports))
+    return next((twin.control for twin in twins), None)
+
+
+def reader_of(ports: Iterable[str]) -> Running | None:
+    """Return the daemon that reads one of a twin's ports, if one does."""
+    asked = _real(ports)
+    return next((each for each in running("daemon") if _real(each.ports) & asked), None)
+
+
+def _real(ports: Iterable[str]) -> set[str]:
+    return {os.path.realpath(port) for port in ports}
 
 
 def _several(there: list[tuple[str, str, str]]) -> SensorError:

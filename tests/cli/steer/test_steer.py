@@ -7,10 +7,13 @@ import json
 import re
 import threading
 from collections.abc import Callable
+from threading import Timer
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fake_control import FakeControl
+from tactomo.running import Running, announced
 from tactomo.service.health_issues import FLAG_ADVICE, health_issues
 from tactomo_client.fake import FakeSensor
 from tactomo_models import Flag
@@ -333,3 +336,32 @@ def test_poke_tells_that_there_is_nothing_to_release(tactomo: Run, control: Any)
     result = tactomo(*command)
     assert (result.returncode, result.stdout) == (1, "")
     assert "no press has this id" in result.stderr
+
+
+def test_a_poke_waits_for_the_reference_of_the_daemon(tactomo: Run, control: Any) -> None:
+    line = {"path": "/dev/made_up", "open": True, "sent": 1}
+    control.answers["status"] = {"rate_hz": 20.0, "ports": [line]}
+    starting = {"state": "running", "reference": None}
+    with FakeControl({"status": starting}) as reader:
+        program = Running("daemon", reader.address, "palm", ports=("/dev/made_up",))
+        tared = {"state": "running", "reference": {"scans": 20}}
+        timer = Timer(1.0, lambda: reader.answers.update(status=tared))
+        with announced(program):
+            timer.start()
+            result = tactomo("poke", "press", "x_mm=1", "--address", control.address)
+            timer.join()
+    assert result.returncode == 0, result.stderr
+    assert "palm has no reference yet" in result.stderr
+    told = [command for command, _ in control.requests]
+    assert told[-1] == "press"
+    assert len(told) > 3
+
+
+def test_a_poke_does_not_wait_where_a_program_of_the_users_own_reads(
+    tactomo: Run, control: Any
+) -> None:
+    line = {"path": "/dev/made_up", "open": True, "sent": 100}
+    control.answers["status"] = {"rate_hz": 20.0, "ports": [line]}
+    result = tactomo("poke", "press", "x_mm=1", "--address", control.address)
+    assert (result.returncode, result.stderr) == (0, "")
+    assert [command for command, _ in control.requests] == ["status", "press"]

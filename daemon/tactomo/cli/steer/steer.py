@@ -11,7 +11,7 @@ import typer
 
 from tactomo.cli import options
 from tactomo.cli.output import print_json, say
-from tactomo.cli.sensors import find_control, find_twin
+from tactomo.cli.sensors import find_control, find_twin, reader_of
 from tactomo.errors import TactomoError
 from tactomo.plain import counted
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from tactomo_client import Daemon, RecordedFile
 
 SOON_S = 3.0
+START_S = 60.0  # in which a daemon builds its models and takes a reference
 USUAL_TARE_SCANS = 20  # where no reference says yet how many the daemon takes
 
 app = options.typer_app()
@@ -173,15 +174,48 @@ def poke(
     press), `release` (id), `clear`, `scene` (list the present presses), `play` (restart the
     scripted scene), `noise` (noise_v), `drift` (swing_k, period_s, step_k, press_creep, ...),
     `mute` (channel, seconds), `garbage` (count, port), `unplug` and `replug` (port), `status`.
+
+    `press` waits for the daemon's reference, at most 60 s: an earlier press would be part of it.
     """
     from tactomo_client import request
 
     named = dict(_named(argument) for argument in arguments or [])
-    answer = request(command, find_twin(address), **named)
+    twin = find_twin(address)
+    if command == "press":
+        _await_reference(twin)
+    answer = request(command, twin, **named)
     if answer.get("released") is False:
         raise TactomoError("no press has this id", "`tactomo poke scene` lists the presses")
     if answer:
         print_json(answer)
+
+
+def _await_reference(twin: str) -> None:
+    """Wait until the daemon that reads a twin has its reference; say so."""
+    end_s, said = time.monotonic() + START_S, ""
+    while why := _untared(twin):
+        if time.monotonic() > end_s:
+            say("this press becomes part of the reference; later: `tactomo tare`", err=True)
+            return
+        if why != said:
+            say(f"waiting: {why}", err=True)
+        said = why
+        time.sleep(0.1)
+
+
+def _untared(twin: str) -> str:
+    """Say why a press would become part of a reference; empty where it would not."""
+    from tactomo_client import request
+
+    told = request("status", twin)
+    reader = reader_of(port["path"] for port in told["ports"])
+    if reader is None:  # or a program of the user's own, for a second: a daemon is known by then
+        is_read = any(port["open"] and port["sent"] > told["rate_hz"] for port in told["ports"])
+        return "" if is_read else "no program reads the twin yet"
+    status = request("status", reader.control)
+    if status["state"] == "taring" or not status["reference"]:
+        return f"{reader.sensor} has no reference yet"
+    return ""
 
 
 def _record_for(daemon: Daemon, name: str, seconds: float | None, maps: bool | None) -> None:
