@@ -29,7 +29,10 @@ LATEST_NS: Final = 2**63 - 2**58
 
 def wall_clock_ns() -> int:
     """Now on the computer's wall clock, ns since 1970; the nearest that can be told, if far off."""
-    return min(max(time.time_ns(), 0), LATEST_NS)
+    try:
+        return min(max(time.time_ns(), 0), LATEST_NS)
+    except OverflowError:  # from the year 2262 on
+        return LATEST_NS
 
 
 class Durations:

@@ -62,6 +62,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     },
 }
 KINDS: Final = {".mcap": "recording", ".toml": "description", ".json": "kept"}
+ENDS: Final = (".npz", ".mcap")
 RATIONED: Final = """
 import json, os, sys
 to_stderr = [(os.POSIX_SPAWN_DUP2, 2, 1)]
@@ -100,11 +101,15 @@ def rationed(folder: Path, *arguments: str) -> Ended:
     return Ended(status, peak_mb, cpu_s, said.decode("utf-8", "replace"))
 
 
-def write_good(path: Path) -> None:
-    """Write a file of scans with which nothing is the matter."""
+def write_good(folder: Path) -> None:
+    """Write good.npz and good.mcap, scans with which nothing is the matter."""
     [volts] = SkinSimulator(load_description("tank_disc")).voltages([]).values()
     noise = 1e-4 * np.abs(volts).mean() * np.random.default_rng(0).normal(size=(6, len(volts)))
-    np.savez(path, structure=volts + noise, structure_reference=volts + noise)
+    arrays = folder / "good.npz"
+    np.savez(arrays, structure=volts + noise, structure_reference=volts + noise)
+    line = ("import", "good.npz", "good.mcap", "-d", "tank_disc", "--rate", "20")
+    ended = rationed(folder, *line)
+    assert ended.status == 0, ended.said
 
 
 def held(folder: Path) -> dict[str, tuple[int, int, int]]:
@@ -121,12 +126,15 @@ CASES: Final = [
 
 
 def read_by(command: str, path: Path, good: Path, folder: Path) -> Ended:
-    """Let a command read a hostile file; AssertionError where it takes or does too much."""
+    """Let a command read a hostile file; AssertionError where it takes or does too much.
+
+    `good` is the folder of `write_good`; `folder` is nobody else's.
+    """
     out = folder / "out"
     out.mkdir(exist_ok=True)
     before = held(path.parent)
     line = COMMANDS[KINDS.get(path.suffix, "arrays")][command]
-    places = {"FILE": str(path), "GOOD.npz": str(good)}
+    places = {"FILE": str(path), **{f"GOOD{end}": str(good / f"good{end}") for end in ENDS}}
     ended = rationed(
         folder,
         *(places.get(word, str(out / word) if word.startswith("OUT") else word) for word in line),

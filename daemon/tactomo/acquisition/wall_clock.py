@@ -9,6 +9,7 @@ import time
 from typing import Final
 
 from tactomo.events import OnEvent
+from tactomo.timing import LATEST_NS, wall_clock_ns
 
 JUMP_S: Final = 0.5
 """A time server that corrects less than this does so bit by bit, by at most 0.5 ms a second."""
@@ -25,11 +26,11 @@ class WallClock:
         # by how much the last time, positive if forwards; None if never
         self.last_jump_s: float | None = None
         self._on_event = on_event
-        self._ahead_ns = time.time_ns() - time.monotonic_ns()
+        self._ahead_ns = _ahead_ns()
 
     def check(self) -> None:
         """Notice a jump since the last call."""
-        before_ns, self._ahead_ns = self._ahead_ns, time.time_ns() - time.monotonic_ns()
+        before_ns, self._ahead_ns = self._ahead_ns, _ahead_ns()
         jump_s = (self._ahead_ns - before_ns) * 1e-9
         if abs(jump_s) < JUMP_S:
             return
@@ -41,3 +42,8 @@ class WallClock:
             f"{'ahead' if jump_s > 0 else 'back'}, or the computer slept",
             "nothing, unless you compare dates across it: use monotonic times",
         )
+
+
+def _ahead_ns() -> int:
+    now_ns = wall_clock_ns()
+    return now_ns - time.monotonic_ns() if 0 < now_ns < LATEST_NS else now_ns  # stands at the ends

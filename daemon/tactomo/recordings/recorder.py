@@ -28,6 +28,7 @@ from tactomo.recordings.active_recording import MAX_QUEUED_BYTES, ActiveRecordin
 from tactomo.recordings.recording import Origin
 from tactomo.recordings.recording_writer import create
 from tactomo.recordings.rotation import dated, list_recordings, next_path, to_delete
+from tactomo.timing import wall_clock_ns
 from tactomo.worker import Worker
 
 FLUSH_S: Final = 0.2
@@ -254,7 +255,7 @@ class Recorder(Worker):
         if path is None:
             with contextlib.suppress(OSError):  # `create` says what is the matter
                 folder.mkdir(parents=True, exist_ok=True)  # the daemon's own
-            path = next_path(folder, self._origin.sensor, time.time())
+            path = next_path(folder, self._origin.sensor, wall_clock_ns() * 1e-9)
         origin = self._origin  # read once: a calibration may be put in force meanwhile
         writer = create(path, origin)
         self.files += 1

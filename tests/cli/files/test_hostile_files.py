@@ -27,10 +27,10 @@ QUICK: Final = {
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A file of scans with which nothing is the matter."""
-    path = tmp_path_factory.mktemp("good") / "good.npz"
-    write_good(path)
-    return path
+    """The folder of files with which nothing is the matter."""
+    folder = tmp_path_factory.mktemp("good")
+    write_good(folder)
+    return folder
 
 
 @pytest.fixture(scope="module")

@@ -21,8 +21,14 @@ def test_a_far_date_of_the_computer_ends_no_thread(
 ) -> None:
     now_ns, path = time.time_ns, tmp_path / "far.mcap"
 
+    def far_ns() -> int:
+        far = now_ns() + years * YEAR_NS
+        if far >= 2**63:
+            raise OverflowError("timestamp too large to convert to C _PyTime_t")  # as Python's own
+        return far
+
     def set_clock() -> None:
-        monkeypatch.setattr(time, "time_ns", lambda: now_ns() + years * YEAR_NS)
+        monkeypatch.setattr(time, "time_ns", far_ns)
 
     if at_start:
         set_clock()
