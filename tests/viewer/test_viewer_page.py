@@ -857,6 +857,7 @@ REPLAY = {
     "paused": False,
     "loop": False,
     "waits_for_page": False,
+    "maps_before": 0,
 }
 
 
@@ -878,6 +879,9 @@ def test_a_replay_is_steered_by_the_page(page: Page) -> None:
     page["step"].click()
     page["loop"].click()
     page["speed"].find_element(By.XPATH, "./option[text()='0.25']").click()
+    moved = REPLAY | {"paused": True, "maps_before": page.js("return tactomo.state.frame.sequence")}
+    page.daemon.answers["replay"] = moved
+    page.skin.status |= {"replay": moved}
     page["position"].send_keys(Keys.END)
     wait_until(lambda: page.health == "replay-moving")  # the map is that of before
     wait_until(lambda: "stale" in page.map_classes)
@@ -906,20 +910,20 @@ def test_a_replay_is_steered_by_the_page(page: Page) -> None:
     wait_until(lambda: page.daemon.requests == [("replay", each) for each in asked])
 
 
-def test_a_move_is_over_where_its_frame_comes_before_its_reply(page: Page) -> None:
-    """They come by different sockets; a paused replay sends no second frame."""
+def test_a_move_is_over_with_its_own_frame_whichever_comes_first(page: Page) -> None:
+    """Reply and frames come by different sockets; a paused replay sends one frame for a move."""
     page.open()
-    is_moving = page.browser.execute_async_script("""
+    is_before = page.browser.execute_async_script("""
         const done = arguments[0];
         import('/replay.js').then(async ({ Replay }) => {
-          const replay = new Replay(async () => { replay.noteFrame(); return true; });
-          replay.fields = { paused: true };
+          const replay = new Replay(async (name, change, tell) => tell({ maps_before: 5 }));
+          replay.fields = { paused: true, maps_before: 2 };
           document.getElementById('position').dispatchEvent(new Event('input'));
-          const isBegun = replay.isMoving;
+          const isAsked = replay.isBefore({ sequence: 6 });
           await new Promise((soon) => setTimeout(soon));
-          done([isBegun, replay.isMoving]);
+          done([isAsked, replay.isBefore({ sequence: 5 }), replay.isBefore({ sequence: 6 })]);
         })""")
-    assert is_moving == [True, False]
+    assert is_before == [True, True, False]
 
 
 def test_a_replay_that_waits_for_the_page_begins_when_its_first_frame_is_seen(page: Page) -> None:

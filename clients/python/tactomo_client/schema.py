@@ -688,6 +688,9 @@ class Replay:
     paused: bool = False
     loop: bool = False
     waits_for_page: bool = False  #: paused until a viewer's page is open
+    #: `sequence` of the last ``map`` message before the replay moved: later maps are of the new
+    #: position
+    maps_before: int = 0
 
 
 @dataclass(frozen=True, slots=True)

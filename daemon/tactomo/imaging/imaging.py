@@ -230,6 +230,11 @@ class Imaging:
         self.calibration.meet_skin(rest.reference)
         self.taring.note_reference()
 
+    @property
+    def maps_published(self) -> int:
+        """The newest map's number."""
+        return int(self._publisher.envelope(MAP)["sequence"])
+
     def forget(self) -> None:
         """Take the next dual scan for the first one: it does not follow on those before."""
         self._reconstructor.reset()

@@ -192,8 +192,8 @@ class Pipeline(Worker):
         """Ask for a time budget; for any thread. The future is done when it is in force."""
         return self._ask(lambda: self._imaging.method.request_budget(budget_ms))
 
-    def move(self, position_s: float) -> Future[None]:
-        """Have the replay go on elsewhere; for any thread. The future is done when that is so."""
+    def move(self, position_s: float) -> Future[dict[str, Any]]:
+        """Have the replay go on elsewhere; for any thread. The future gets its fields then."""
         return self._ask(lambda: self._move(position_s))
 
     def step(self) -> None:
@@ -250,10 +250,12 @@ class Pipeline(Worker):
             return MarkPairer(replay.marks_of_pass())
         return CounterPairer(self._channels, self._sync_wait_ns)
 
-    def _move(self, position_s: float) -> None:
+    def _move(self, position_s: float) -> dict[str, Any]:
         """Go on elsewhere: what waits, and what the ports read before they follow, is left out."""
         assert self._replay is not None
-        self._replay.playback.move(position_s)
+        playback = self._replay.playback
+        playback.maps_before = self._imaging.maps_published
+        playback.move(position_s)
         self._replay_clock = ReplayClock(self._ports, self._replay.is_paced)
         self.finished.clear()
         before, self.sync = self.sync, self._new_sync()
@@ -264,6 +266,7 @@ class Pipeline(Worker):
         self.sync.carry_on(before)
         self.skew = Skew()
         self._imaging.forget()
+        return playback.fields()
 
     def _obey_commands(self) -> None:
         while not self._commands.empty():

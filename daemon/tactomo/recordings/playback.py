@@ -25,10 +25,11 @@ class Playback:
 
     Attributes:
         begin_ns: where the pass began.
+        maps_before: how many maps were published before it began.
     """
 
     def __init__(self, start_ns: int, end_ns: int, speed: float) -> None:
-        self.passes = 0  # how often it was moved
+        self.passes = self.maps_before = 0  # passes: how often it was moved
         self.start_ns = self.begin_ns = start_ns
         self.loops = False  # whether the end is followed by the beginning
         self.waits_for_page = False  # whether it is paused until somebody looks
@@ -69,6 +70,7 @@ class Playback:
                 "paused": self.is_paused,
                 "loop": self.loops,
                 "waits_for_page": self.waits_for_page,
+                "maps_before": self.maps_before,
             }
 
     def wait_until_due(self, clock_ns: int | None, timeout_s: float, number: int) -> bool:

@@ -46,10 +46,13 @@ Result = Mapping[str, Any]
 
 
 class Settling(NamedTuple):
-    """A result that is known before it is in force; told when it is, or after SETTLE_S."""
+    """A result that is known before it is in force; told when it is, or after SETTLE_S.
+
+    What the future has is told instead, where it has more to say.
+    """
 
     result: Result
-    in_force: Future[None]
+    in_force: Future[Any]
 
 
 Outcome = Result | Future[Result] | Settling

@@ -248,6 +248,17 @@ def test_a_step_gives_one_frame_of_a_read_that_brought_several(play: Any, tmp_pa
     b.until(lambda: b.ask("status")["state"] == "ended")
 
 
+def test_the_reply_to_a_move_tells_which_maps_are_of_before(play: Any, life: Life) -> None:
+    b = play(life.path)
+    for position_s in (life.times_s[list(life.values)[5]], 0.0):
+        moved = b.ask("replay", position_s=position_s)
+        assert moved["position_s"] == pytest.approx(position_s)
+        frame = b.listener.wait("map", lambda f, n=moved["maps_before"]: f["sequence"] > n)
+        assert frame["sequence"] == moved["maps_before"] + 1
+        shown = life.times_s[frame["scan_counter"]]
+        assert shown == pytest.approx(position_s, abs=0.2)
+
+
 @pytest.mark.slow
 def test_a_move_into_the_middle_of_a_packet_is_no_damage(play: Any, torn: Path) -> None:
     b = play(torn)

@@ -8,9 +8,7 @@ export class Replay {
   constructor(command) {
     this.command = command;
     this.fields = null;
-    this.moves = null;  // where it is to go on, until that is asked for
-    this.isMoving = false;  // whether the map is still that of before
-    this.hasFrame = false;  // whether one has come since the daemon was asked to move
+    this.moves = null;  // where it is to go on, until that is answered
     byId("play").onclick = () => this.#ask(
       this.#hasEnded ? { position_s: 0, paused: false } : { paused: !this.fields.paused });
     byId("step").onclick = () => this.#ask({ step: true });
@@ -55,27 +53,21 @@ export class Replay {
     slider.ariaValueText = `${fixed(Number(slider.value), 1)} s`;
   }
 
-  /** Take note of a new frame. */
-  noteFrame() {
-    this.hasFrame = true;
-    if (this.moves === null) this.isMoving = false;
+  /** Whether a frame is of before the last move: replies and frames come by different sockets. */
+  isBefore(frame) {
+    return this.moves !== null || frame?.sequence <= this.fields?.maps_before;
   }
 
   // While the daemon moves, the slider may be pulled on: then it moves there next.
   async #move(position_s) {
     const isUnderWay = this.moves !== null;
     this.moves = position_s;
-    this.isMoving = true;
     if (isUnderWay) return;
-    let isObeyed = false;
     for (let asked = null; asked !== this.moves;) {
       asked = this.moves;
-      this.hasFrame = false;
-      isObeyed = await this.#ask({ position_s: asked });
+      await this.#ask({ position_s: asked });
     }
     this.moves = null;
-    // The frame may come before the reply, and a paused replay sends no other one.
-    if (!isObeyed || (this.hasFrame && this.fields.paused)) this.isMoving = false;
   }
 
   get #hasEnded() {
@@ -83,6 +75,9 @@ export class Replay {
   }
 
   #ask(change) {
-    return this.command("replay", change);
+    return this.command("replay", change, (fields) => {
+      Object.assign(this, { fields, shownAt: performance.now() });
+      return "";
+    });
   }
 }

@@ -26,7 +26,7 @@ const state = {
   painted: [],              // {at, latency} of the last frames, ms
   fitted: { kpa: 0, percent: 0 },
   awaited: null,            // the press whose picture is awaited
-  get isMoving() { return replay.isMoving; },
+  get isMoving() { return replay.isBefore(state.frame); },
 };
 
 const view = new MapView(byId("map"));
@@ -70,7 +70,6 @@ function onFrame(frame) {
   if (state.drawn?.session !== frame.session) state.fitted = { kpa: 0, percent: 0 };
   state.frame = frame;
   timeline.add(frame);
-  replay.noteFrame();
   redraw();
 }
 
