@@ -224,10 +224,10 @@ def deep_metadata(path: Path) -> None:
 
 
 def wide_description(path: Path) -> None:
-    """A sheet 10 m wide: the largest mesh that its map's nodes seem to allow."""
+    """A sheet 3 m wide: the largest mesh that its map's nodes seem to allow."""
     text = (resources.files("tactomo_models.sensor.shipped") / "paper_square.toml").read_text()
-    lines = ["width_m = 10.0" if line.startswith("width_m") else line for line in text.splitlines()]
-    assert lines.count("width_m = 10.0") == 1
+    lines = ["width_m = 3.0" if line.startswith("width_m") else line for line in text.splitlines()]
+    assert lines.count("width_m = 3.0") == 1
     path.write_text("\n".join(lines))
 
 

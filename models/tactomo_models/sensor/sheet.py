@@ -40,7 +40,7 @@ Place = Annotated[
 Ring = Annotated[tuple[Place, ...], Field(min_length=3, strict=False)]
 
 
-MIN_POLYGON_M = 1e-3  # a smaller sheet was drawn in another unit
+MIN_SHEET_M, MAX_SHEET_M = 1e-3, 3.0  # of another size, a sheet was drawn in another unit
 
 
 class Sheet(Section):
@@ -79,13 +79,7 @@ class Sheet(Section):
             raise ValueError(
                 f"height_m = {self.height_m}: must be left out for a disc, width_m is its diameter"
             )
-        if is_polygon and min(self.size_m) < MIN_POLYGON_M:
-            wide, high = self.size_m
-            raise ValueError(
-                f"outline_m: the sheet is {1e3 * wide:.4g} x {1e3 * high:.4g} mm; if this should "
-                f"be {1e6 * wide:.4g} x {1e6 * high:.4g} mm, multiply outline_m, holes_m and "
-                "positions_m by 1000"
-            )
+        self._check_unit()
         limit = min(self.size_m) / 4
         if self.frame_width_m >= limit:
             raise ValueError(
@@ -93,6 +87,20 @@ class Sheet(Section):
                 f"smaller side, {limit:.4g}"
             )
         return self
+
+    def _check_unit(self) -> None:
+        wide, high = self.size_m
+        keys = "outline_m, holes_m and positions_m" if self.outline_m else "width_m and height_m"
+        if min(wide, high) < MIN_SHEET_M:
+            raise ValueError(
+                f"the sheet is {1e3 * wide:.4g} x {1e3 * high:.4g} mm; if this should be "
+                f"{1e6 * wide:.4g} x {1e6 * high:.4g} mm, multiply {keys} by 1000"
+            )
+        if max(wide, high) > MAX_SHEET_M:
+            raise ValueError(
+                f"the sheet is {wide:.4g} x {high:.4g} m, and may be {MAX_SHEET_M:g} m: in "
+                f"centimetres or millimetres? divide {keys} by 100 or 1000"
+            )
 
     @cached_property
     def outline(self) -> Outline:

@@ -23,6 +23,12 @@ def outlined(outline: str, holes: str = "[]") -> str:
     return re.sub(r"outline_m = .*?\n\]\n", keys, shipped_text("palm_l"), count=1, flags=re.S)
 
 
+def scaled(text: str, factor: float) -> str:
+    """The text with all corners and electrodes of a polygon in another unit."""
+    pair = re.compile(r"\[(-?[\d.]+), (-?[\d.]+)\]")
+    return pair.sub(lambda at: str([factor * float(each) for each in at.groups()]), text)
+
+
 def placed(first: str) -> str:
     return shipped_text("palm_l").replace("[-0.045, -0.06]", first, 1)
 
@@ -36,6 +42,8 @@ def with_tables(tables: str) -> str:
     [
         (outlined(CORNERS.replace("0.06", "60.0")), "", "in millimetres? -60 mm are -0.06 m"),
         (outlined(CORNERS.replace("0.06", "6e-5")), "", "should be 120 x 120 mm, multiply"),
+        (scaled(shipped_text("palm_l"), 100), "", "12 x 12 m, and may be 3 m: in centimetres or"),
+        (shipped_text("skin_round").replace("width_m = 0.", "width_m = 9."), "", "width_m and"),
         (shipped_text("palm_l").replace("= 0.006", "= 6e-6"), "", "6 mm are 0.006 m"),
         (shipped_text("palm_l").replace("= 0.006", "= 6.0"), "", "give a shorter one, in metres"),
         (outlined("[[-0.06, -0.06], [0.06, 0.06], [0.06, -0.06], [-0.06, 0.06]]"), "", "crosses"),
