@@ -26,7 +26,7 @@ from tactomo_models.methods.method import Estimate, Method, Skin, UnsolvableErro
 from tactomo_models.methods.registry import check_method, make_method
 from tactomo_models.physics.artifact import Artifact
 from tactomo_models.scans.changes import Changes
-from tactomo_models.scans.companion_forces import CompanionReading
+from tactomo_models.scans.companion_forces import CompanionForce, CompanionReading
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scans.reference import Reference
@@ -246,9 +246,12 @@ class Reconstructor:
             or not are_still(still.changes, measurement.changes)
         ):
             self._still = still = _Still(time_s, measurement.changes)
-        late = {each.name for each in readings if each.since_s > time_s - still.since_s}
-        kept = {name: one for name, one in measurement.companions.items() if name not in late}
-        return replace(measurement, companions=kept)
+        in_time = {each.name for each in readings if each.since_s <= time_s - still.since_s}
+        kept, late = (
+            {name: one for name, one in measurement.companions.items() if (name in in_time) is are}
+            for are in (True, False)
+        )
+        return replace(measurement, companions=kept, late_companions=late)
 
     def _measured(self, channel: Channel, scan: FloatArray | None) -> FloatArray | None:
         """A scan less the drives and pairs that repeat the last one; all of it may come again."""
@@ -376,6 +379,7 @@ class Reconstructor:
             flags=flags,
             stage_s=measurement.stage_s,
             force_n=0.0 if changes else float("nan"),
+            companions=_judged(measurement, {}),
         )
 
     def _frame(self, estimate: Estimate, measurement: Measurement) -> Reconstruction:
@@ -430,6 +434,7 @@ class Reconstructor:
             confidence=estimate.confidence,
             force_n=force_n,
             force_sigma_n=force_sigma_n,
+            companions=_judged(measurement, estimate.companions),
         )
 
     def _areas_of(self, estimate: Estimate) -> tuple[Areas, FloatArray, FloatArray]:
@@ -450,6 +455,14 @@ class Reconstructor:
             size = np.asarray((image * (areas.on_map > 0)).sum(axis=(1, 2)) / share)
         assert size is not None
         return areas, size, np.broadcast_to(estimate.magnitude_sigmas, len(areas))
+
+
+def _judged(measurement: Measurement, agrees: Mapping[str, bool]) -> dict[str, CompanionForce]:
+    """The companions of a frame, with what became of each."""
+    late = {k: replace(one, state="late") for k, one in measurement.late_companions.items()}
+    words = {True: "fitted", False: "disputed", None: "unused"}
+    in_time = measurement.companions.items()
+    return late | {k: replace(one, state=words[agrees.get(k)]) for k, one in in_time}
 
 
 class _Still(NamedTuple):

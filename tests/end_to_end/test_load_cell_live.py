@@ -66,6 +66,17 @@ def live(demo: Demo) -> Path:
     return Path(recording.path)
 
 
+def test_the_status_says_what_the_cell_reads_and_whether_it_is_believed(
+    demo: Demo, live: Path
+) -> None:
+    with Daemon(demo.control) as daemon:
+        wait_until(lambda: daemon.status().companions["load_cell"].state == "fitted")
+        cell = daemon.status().companions["load_cell"]
+        assert cell.force_n == pytest.approx(TRUTH_N, rel=0.04)
+        assert cell.reading == pytest.approx(5.0 + TRUTH_N / 2, rel=0.04)
+        assert cell.force_sigma_n == pytest.approx(np.hypot(0.5, 0.01 * TRUTH_N), rel=0.05)
+
+
 def replayed(live: Path, description: Path, again: Path) -> dict[int, Frame]:
     """Frames by scan counter, as a daemon makes them of a recording."""
     command = [sys.executable, "-m", "tactomo.cli", "replay", live, "--speed", "max"]

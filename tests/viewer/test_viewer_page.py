@@ -546,6 +546,10 @@ def test_status_is_shown_part_by_part_and_foreign_text_stays_text(page: Page) ->
         "reference": {"scans": 20, "taken_realtime_ns": time.time_ns()},
         "recording": {"path": "/data/a.mcap", "bytes": 1_500_000},
         "description": DESCRIPTION | {"model": nasty},
+        "companions": {
+            "cell": {"state": "fitted", "reading": 255.5, "force_n": 127, "force_sigma_n": 2.5},
+            "pad": {"state": "missing", "reading": None, "force_n": None, "force_sigma_n": None},
+        },
     }
     page.open()
     wait_until(lambda: "21.2, 44.0 ms" in page["stages"].text)
@@ -553,6 +557,8 @@ def test_status_is_shown_part_by_part_and_foreign_text_stays_text(page: Page) ->
     assert channels[:2] == ["magnitude", "no scans"]
     assert "20.0 scans/s" in channels
     assert "/dev/ttySKIN" in channels
+    assert channels[channels.index("cell") + 1] == "255.5: 127.0 ± 2.5 N, fitted"
+    assert channels[channels.index("pad") + 1] == "missing"
     assert page["reference"].text.startswith("Reference of 20 scans")
     assert page["record"].text == "Stop · 1.5 MB"
     assert page["source"].text == "simulated skin"

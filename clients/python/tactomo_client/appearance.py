@@ -21,6 +21,13 @@ COLOURS: Final = ((0, 0, 4), (87, 16, 110), (188, 55, 84), (249, 142, 9), (252, 
 PRESSED_COLOUR: Final = (40, 60, 90)
 UNKNOWN_COLOUR: Final = (30, 30, 30)
 
+COMPANION_STATES: Final = {
+    "disputed": "not used: it contradicts the sheets",
+    "late": "not used: of before the sheets last moved",
+    "missing": "no reading within its limits",
+    "unused": "not needed: nothing presses, or the method takes none",
+}
+"""What became of a companion, in words; `fitted` says so itself."""
 DEFAULT_PRESSURE_MAX_KPA: Final = 300.0
 DEFAULT_MAGNITUDE_MAX: Final = 0.25
 
@@ -47,6 +54,16 @@ def map_pixels(frame: Frame, description: Mapping[str, Any]) -> NDArray[np.uint8
         pixels[pressed] = PRESSED_COLOUR
     pixels[~known_nodes(frame, image)] = UNKNOWN_COLOUR
     return pixels.astype(np.uint8)
+
+
+def companion_words(companion: Mapping[str, Any]) -> str:
+    """Return what a companion reads, and whether it is believed, of an entry of `companions`."""
+    state, force_n = str(companion["state"]), companion["force_n"]
+    believed = COMPANION_STATES.get(state, state)
+    if force_n is None:
+        return believed
+    sigma_n = companion["force_sigma_n"]
+    return f"reads {companion['reading']:g}: {force_n:z.1f} ± {sigma_n:.1f} N, {believed}"
 
 
 def shown_image(

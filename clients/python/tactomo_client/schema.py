@@ -668,6 +668,19 @@ class Baseline:
 
 
 @dataclass(frozen=True, slots=True)
+class Companion:
+    """What a companion of the sensor description, such as a load cell, said of the newest frame."""
+
+    #: ``fitted`` beside the sheets; left out as ``disputed`` (it contradicts the sheets), ``late``
+    #: (of before the sheets last moved) or ``missing`` (no reading within its limits); ``unused``
+    #: where nothing presses, or by a method that takes none
+    state: str
+    reading: float | None  #: in its own unit
+    force_n: float | None  #: by gain and offset, since the tare
+    force_sigma_n: float | None  #: its standard uncertainty
+
+
+@dataclass(frozen=True, slots=True)
 class Plan:
     """What frames are given for the method and the budget that were asked for."""
 
@@ -808,6 +821,8 @@ class Status(Received):
     reference: Reference | None = None
     #: How the reference follows the skin's drift
     baseline: Baseline = field(default_factory=Baseline)
+    #: What the sensor's companions said of the newest frame, by name
+    companions: Mapping[str, Companion] = field(default_factory=dict)
     #: Processing time of each stage of the pipeline
     stage_ms: Mapping[str, Percentiles] = field(default_factory=dict)
     latency_ms: Percentiles | None = None  #: Time from the last byte read to publication

@@ -88,6 +88,20 @@ def map_fields(
     }
 
 
+def companion_fields(description: SensorDescription, frame: Reconstruction) -> dict[str, Any]:
+    """Return what `status` says of each companion of the sensor, by its name."""
+    return {
+        name: {
+            "state": "missing" if one is None else one.state,
+            "reading": one and one.reading,
+            "force_n": one and one.force_n,
+            "force_sigma_n": one and one.sigma_n,
+        }
+        for name in description.companion
+        for one in (frame.companions.get(name),)
+    }
+
+
 def description_fields(description: SensorDescription) -> dict[str, Any]:
     """Return what `status` says about the sensor."""
     width_m, height_m = description.width_m, description.height_m

@@ -116,6 +116,7 @@ class Imaging:
         self._publisher = publisher
         self._on_event = on_event
         self._contacts = 0  # in the last frame
+        self.companions: dict[str, Any] = {}  # what `status` says of them; swapped
         self._has_moved = False  # a replay; the next frame is found anew
         self._took_s: tuple[float, float] | None = None  # processor time and time; None if quiet
         self._processor = ProcessorShare()
@@ -284,6 +285,7 @@ class Imaging:
             self.method.put_in_force(usual)
         if frame is not None:
             self._contacts = len(frame.contacts)
+            self.companions = frames.companion_fields(self._description, frame)
             self._publish_frame(dual, timing, frame)
         self.taring.add(volts, lost, self._contacts, companions)
 

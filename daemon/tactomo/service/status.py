@@ -98,6 +98,7 @@ class Status:
             "reference": rest
             and {"scans": rest.reference.scans, "taken_realtime_ns": rest.realtime_ns},
             "baseline": imaging.baseline,
+            "companions": imaging.companions,
             "stage_ms": {stage: times for stage, times in stages.items() if times},
             "latency_ms": latency.percentiles_ms(),
             "methods": list(self._methods),

@@ -42,7 +42,7 @@ _COUNTED: Final = frozenset(
     {
         *("uptime_s", "ports", "rates", "scans", "frames", "last_minute", "scan_tally", "events"),
         *("channel_skew_ms", "wall_clock", "stage_ms", "latency_ms", "baseline", "process"),
-        "recording",
+        *("recording", "companions"),
     }
 )
 """Fields of a status that differ from second to second; some of them say something beside that."""

@@ -249,6 +249,8 @@ class Fit:
             flags=flags,
             made_by="fit",
             reason="; ".join([f"{how}, {_in_words(belief)}", *course.disputed.values()]),
+            companions=dict.fromkeys(measurement.companions, True)
+            | dict.fromkeys(course.disputed, False),
             carried=course,
             lasting=course.at_rest,
         )

@@ -18,6 +18,7 @@ A method of one's own is a class with these two functions. This one is complete:
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
@@ -105,6 +106,7 @@ class Estimate:
         made_by: what made the estimate, in a word, for the frame's `tier`; the method's name if
             empty.
         reason: why, in words.
+        companions: of each companion that was looked at, whether it agrees with the sheets.
         carried: what the method wants to find in `previous` at the next frame; nobody else reads
             it.
         lasting: what it wants to find there instead after frames in which nothing pressed; None
@@ -124,6 +126,7 @@ class Estimate:
     flags: Flag = field(default_factory=lambda: Flag(0))
     made_by: str = ""
     reason: str = "as requested"
+    companions: Mapping[str, bool] = field(default_factory=dict)
     carried: object = None
     lasting: object = None
 

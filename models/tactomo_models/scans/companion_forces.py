@@ -30,10 +30,14 @@ class CompanionReading(NamedTuple):
 class CompanionForce:
     """What one companion reads of a frame."""
 
+    reading: float  #: in its own unit
     force_n: float  #: since the tare
     sigma_n: float  #: its standard uncertainty
     #: (P,) what one kPa at each pressable node adds: the companion feels n_per_kpa @ pressure
     n_per_kpa: FloatArray
+    #: in a `Reconstruction`: `fitted` beside the sheets; left out as `disputed`, or as `late`, of
+    #: before the sheets last moved; `unused`, where nothing presses or the method takes none
+    state: str = "unused"
 
     def agrees_with(self, force_n: float, sigma_n: float = 0.0) -> bool:
         """Whether a force of that standard uncertainty may be the same."""

@@ -30,6 +30,8 @@ class Measurement:
     may_drift: bool = True  #: whether a drift since the tare may explain what contacts do not
     #: of each companion that has a usable reading
     companions: Mapping[str, CompanionForce] = field(default_factory=dict)
+    #: of each whose reading may be of before the sheets last moved
+    late_companions: Mapping[str, CompanionForce] = field(default_factory=dict)
 
     @property
     def data(self) -> Mapping[Channel, Changes]:

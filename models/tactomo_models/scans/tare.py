@@ -385,7 +385,8 @@ class Tare:
         offset = at_rest.get(reading.name, companion.offset)
         force_n = companion.gain_n_per_unit * (reading.value - offset)
         sigma_n = float(np.hypot(companion.noise_n, companion.relative_error * force_n))
-        return CompanionForce(force_n, sigma_n, self.sensor.companion_weights[reading.name])
+        weights = self.sensor.companion_weights[reading.name]
+        return CompanionForce(reading.value, force_n, sigma_n, weights)
 
     def _are_one(self, magnitude: FloatArray | None, structure: FloatArray | None) -> bool:
         """Tell whether both channels carry one sheet's scan: noise makes no two of them alike."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from tactomo_models.arrays import Image
+from tactomo_models.scans.companion_forces import CompanionForce
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scene.contacts import Contact
 
@@ -38,4 +40,6 @@ class Reconstruction:
     force_n: float = float("nan")
     #: standard uncertainty of `force_n`; NaN where unknown, and where nothing presses
     force_sigma_n: float = float("nan")
+    #: of each companion that has a usable reading
+    companions: Mapping[str, CompanionForce] = field(default_factory=dict)
     failure: str = ""  #: what a method of the user's own failed of; empty where none did

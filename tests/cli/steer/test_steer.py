@@ -54,6 +54,10 @@ STATUS = {
         "drift": {"magnitude": {"gain": -0.0123, "uneven": 0.0009}},
     },
     "recording": {"path": "/tmp/a.mcap", "bytes": 2_500_000},
+    "companions": {
+        "cell": {"state": "disputed", "reading": 255.5, "force_n": 127.0, "force_sigma_n": 2.5},
+        "pad": {"state": "missing", "reading": None, "force_n": None, "force_sigma_n": None},
+    },
     "subscribers": 1,
 }
 NEW_DAEMON = {
@@ -88,6 +92,8 @@ def test_status_shows_what_matters(tactomo: Run, control: Any) -> None:
         ),
         *("20 dual scans", "/tmp/a.mcap (2.5 MB)", "auto; the newest frame by levelset"),
         *("refused: [neither] contact nor drift", "magnitude drifted by -1.23%, unevenly by 0.09%"),
+        "cell reads 255.5: 127.0 ± 2.5 N, not used: it contradicts the sheets",
+        "pad no reading within its limits",
         "12 ms: fit, 4.50 modelled ms; machine speed: measured here",
     ):
         assert words in result.stdout

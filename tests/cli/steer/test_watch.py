@@ -32,6 +32,9 @@ STATUS = {
     "rates": {"frames_hz": 19.7},
     "latency_ms": {"p50": 3.0, "p99": 5.0},
     "description": {"pressure_max_kpa": 200.0},
+    "companions": {
+        "cell": {"state": "fitted", "reading": 255.5, "force_n": 127.0, "force_sigma_n": 2.5}
+    },
 }
 
 
@@ -76,6 +79,7 @@ def test_it_shows_map_contacts_and_health_and_ends_by_ctrl_c(sensor: FakeSensor)
     assert "▀" * 51 in shown
     assert "171 kPa" in shown
     assert "running" in shown
+    assert "reads 255.5: 127.0 ± 2.5 N" in " ".join(shown.split())
 
 
 def test_it_says_when_data_are_stale() -> None:

@@ -66,6 +66,8 @@ def test_a_force_is_surer_with_a_load_cell(reconstructor: Reconstructor, scan: F
     alone, both = (cold(reconstructor, scan, force_n) for force_n in (None, BALL_N))
     assert not alone.flags & (Flag.COMPANION_MISSING | Flag.COMPANION_DISPUTED)
     assert not both.flags
+    cell = both.companions["load_cell"]
+    assert (cell.reading, cell.force_n, cell.state) == (BALL_N / 2 + 5, BALL_N, "fitted")
     assert both.force_n == pytest.approx(BALL_N, rel=0.02)
     off = [abs(frame.contacts[0].peak_kpa - 180) for frame in (alone, both)]
     assert off[1] < 18 < off[0]  # right to 10 %, as `tactomo evaluate field` counts
@@ -81,6 +83,7 @@ def test_a_load_cell_that_contradicts_the_sheet_is_named_and_left_out(
     alone, wrong = (cold(reconstructor, scan, force_n) for force_n in (None, factor * BALL_N))
     assert Flag.COMPANION_DISPUTED in wrong.flags
     assert "companion load_cell reads" in wrong.reason
+    assert wrong.companions["load_cell"].state == "disputed"
     assert wrong.force_n == pytest.approx(alone.force_n, rel=1e-6)
     again = reconstructor.reconstruct(scan, None, companions=[("load_cell", BALL_N / 2 + 5)])
     assert not again.flags & Flag.COMPANION_DISPUTED  # it is believed once it agrees
@@ -106,8 +109,11 @@ def test_a_reading_from_before_the_sheets_moved_tells_nothing(
         reading = CompanionReading("load_cell", 30.0, time_s=frame / 20, since_s=0.07)
         measurement = reconstructor.compare(scan, None, companions=[reading])
         assert Flag.COMPANION_MISSING not in measurement.flags
-        found.append(bool(measurement.companions))
-    assert found == [False, False, True, True, False, False, True, True]
+        frame_of_it = reconstructor.solve(measurement)
+        found.append(frame_of_it.companions["load_cell"].state)
+    assert found[:4] == ["late", "late", "unused", "unused"]  # nothing presses
+    assert found[4:6] == ["late", "late"]
+    assert not {"late", "unused"} & set(found[6:])
 
 
 def test_a_companion_feels_its_region_alone(sensor: SensorDescription) -> None:

@@ -59,6 +59,8 @@ def _plain(told: Any) -> Any:
 
 
 def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
+    from tactomo_client.appearance import companion_words
+
     rates = status.get("rates") or {}
     latency = status.get("latency_ms") or {}
     recording = status.get("recording")
@@ -99,6 +101,10 @@ def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
         ),
         ("reference", counted(reference["scans"], "dual scan") if reference else "none yet"),
         ("baseline", _baseline(status.get("baseline") or {})),
+        *(
+            ("companion", f"{name} {companion_words(each)}")
+            for name, each in (status.get("companions") or {}).items()
+        ),
         ("recording", f"{recording['path']} ({_mb(recording['bytes'])})" if recording else "off"),
         ("subscribers", str(status.get("subscribers", "-"))),
         ("events", _events(status.get("events") or {})),

@@ -233,9 +233,11 @@ def _contact_table(frame: Frame) -> RenderableType:
 def _health(view: View, frame: Frame) -> RenderableType:
     from rich.table import Table
     from rich.text import Text
+    from tactomo_client.appearance import companion_words
 
     status = view.status
     latency = status and status.latency_ms
+    companions = (status.fields.get("companions") or {}) if status else {}
     rows = {
         "rate": f"{status.rates.frames_hz:.1f} frames/s" if status else "-",
         "latency": f"{latency.p50:.1f} ms (p99 {latency.p99:.1f})" if latency else "-",
@@ -245,6 +247,7 @@ def _health(view: View, frame: Frame) -> RenderableType:
         "misfit": "-" if frame.misfit is None else f"{frame.misfit:.2f}",
         "flags": ", ".join(sorted(frame.flags)) or "none",
         "source": status.source.kind if status else "-",
+        **{name: companion_words(each) for name, each in companions.items()},
     }
     table = Table(box=None, show_header=False, pad_edge=False)
     for name, value in rows.items():
