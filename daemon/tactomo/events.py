@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, Protocol
 
 from tactomo_client.schema import EVENTS
 
@@ -68,14 +68,6 @@ class RateLimit:
         return True
 
 
-class _Happened(NamedTuple):
-    severity: str
-    detail: str
-    next_step: str
-    realtime_ns: int
-    monotonic_s: float
-
-
 class EventBook:
     """Says what is to be told, counts that by name, and keeps the last troubles.
 
@@ -85,7 +77,8 @@ class EventBook:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
-        self._troubles: dict[str, _Happened] = {}  # the last of each name, the newest at the end
+        # the last of each name, with when that was, the newest at the end
+        self._troubles: dict[str, tuple[float, dict[str, Any]]] = {}
         self._allowance: dict[str, _Allowance] = {}
         self._limits: dict[tuple[str, str], RateLimit] = {}  # by name and what it is about
         self._lasting: dict[tuple[str, str], str] = {}  # what has not ended, with its reason
@@ -107,46 +100,25 @@ class EventBook:
             return True
 
     def note(self, name: str, detail: str, next_step: str) -> int | None:
-        """Take note of an event.
-
-        Returns:
-            None where the log is to be spared this one; else how many it was spared before.
-        """
+        """Take note of an event; return how many the log was spared before, None for one more."""
         now_s, severity = time.monotonic(), EVENTS[name].severity
         with self._lock:
             self._counts[name] += 1
             if severity != "info":
                 self._troubles.pop(name, None)
-                happened = _Happened(severity, detail, next_step, wall_clock_ns(), now_s)
-                self._troubles[name] = happened
+                told: dict[str, Any] = {"name": name, "severity": severity, "detail": detail}
+                told |= {"next_step": next_step, "realtime_ns": wall_clock_ns()}
+                self._troubles[name] = now_s, told
             return self._allowance.setdefault(name, _Allowance(now_s)).take(now_s)
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """How often each event happened, by name."""
-        with self._lock:
-            return dict(self._counts)
 
     def fields(self) -> dict[str, Any]:
         """Return what `status` says of events."""
         now_s = time.monotonic()
         with self._lock:
-            troubles = list(self._troubles.items())[-TROUBLES_KEPT:]
+            newest = list(reversed(self._troubles.values()))[:TROUBLES_KEPT]
             counts = dict(self._counts)
-        return {
-            "counts": counts,
-            "troubles": [
-                {
-                    "name": name,
-                    "severity": happened.severity,
-                    "detail": happened.detail,
-                    "next_step": happened.next_step,
-                    "realtime_ns": happened.realtime_ns,
-                    "age_s": now_s - happened.monotonic_s,
-                }
-                for name, happened in reversed(troubles)
-            ],
-        }
+        troubles = [{**told, "age_s": now_s - at_s} for at_s, told in newest]
+        return {"counts": counts, "troubles": troubles}
 
 
 class _Allowance:

@@ -25,11 +25,7 @@ def write_mcap(
     description: Mapping[str, Any],  # the sensor, as `status` has it; empty where it is not known
     placement: Placement | None = None,  # where the sensor hangs
 ) -> int:
-    """Write frames as an MCAP file, and return how many there were; one at a time is in memory.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write frames as an MCAP file, one at a time; return how many. Raises OSError as files do."""
     context = foxglove.Context()
     transforms = FrameTransformsChannel("/tf", context=context)
     topics = SensorTopics(sensor, context, transforms, placement or Placement())

@@ -45,11 +45,7 @@ class TactomoCameraConfig(CameraConfig):
     """How long to wait for the first frame."""
 
     def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            ValueError: one is not positive.
-        """
+        """Raise ValueError where a number is not positive."""
         for name in ("max_kpa", "fps", "width", "height", "timeout_s"):
             if not (value := getattr(self, name)) or value <= 0:
                 raise ValueError(f"{name} = {value!r}: give a positive number")
@@ -71,11 +67,7 @@ class TactomoCamera(Camera):
 
     @staticmethod
     def find_cameras() -> list[dict[str, Any]]:
-        """Raise: a stream does not list its sensors.
-
-        Raises:
-            NotImplementedError: always.
-        """
+        """Raise NotImplementedError: a stream does not list its sensors."""
         raise NotImplementedError("`tactomo status` names the sensor of the daemon that runs")
 
     def connect(self, warmup: bool = True) -> None:
@@ -99,19 +91,11 @@ class TactomoCamera(Camera):
             )
 
     def read(self) -> Picture:
-        """Wait for the next frame.
-
-        Raises:
-            TimeoutError: it does not come within `timeout_s`.
-        """
+        """Wait for the next frame; raise TimeoutError where none comes within `timeout_s`."""
         return self._next(self.config.timeout_s)
 
     def async_read(self, timeout_ms: float = 200) -> Picture:
-        """Return the newest frame that was not read yet; wait where there is none.
-
-        Raises:
-            TimeoutError: it does not come.
-        """
+        """Return the newest unread frame, or wait for one; raise TimeoutError where none comes."""
         frame = self._connected().latest()
         if frame is None or self._shown == (frame.session, frame.sequence):
             return self._next(timeout_ms * 1e-3)
@@ -132,11 +116,7 @@ class TactomoCamera(Camera):
         return self._picture(frame)
 
     def disconnect(self) -> None:
-        """Stop receiving.
-
-        Raises:
-            DeviceNotConnectedError: it is not connected.
-        """
+        """Stop receiving; raise DeviceNotConnectedError where nothing is received."""
         self._connected().close()
         self._skin = self._shown = None
 

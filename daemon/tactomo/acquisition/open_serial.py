@@ -36,13 +36,7 @@ _GLANCE_S: Final = 0.05
 
 
 def open_serial(url: str, baud: int) -> serial.Serial:
-    """Open a device's path or a pyserial URL, for this process alone.
-
-    Raises:
-        PortAbsentError: it does not exist.
-        PortBusyError: another process holds it.
-        PortError: it is no serial device or may not be opened.
-    """
+    """Open a path or a pyserial URL for this process alone; the PortError says why not."""
     try:
         port: serial.Serial = serial.serial_for_url(
             url,

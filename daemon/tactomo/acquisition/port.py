@@ -24,7 +24,6 @@ from tactomo_protocol import (
     Channel,
     CommandCode,
     CompanionReading,
-    DecoderCounts,
     Hello,
     Packet,
     Scan,
@@ -36,7 +35,7 @@ from tactomo.acquisition.connection import Connection
 from tactomo.acquisition.device_clock import MAX_RATE, ClockState, DeviceClock
 from tactomo.acquisition.liveness import DeviceState, Liveness
 from tactomo.acquisition.open_serial import other_holders
-from tactomo.acquisition.replay_source import ReplaySource, Source
+from tactomo.acquisition.replay_source import ReplaySource
 from tactomo.events import OnEvent, times
 from tactomo.protocols import PortProtocol, Trouble
 from tactomo.recordings.active_recording import ActiveRecording
@@ -113,10 +112,13 @@ class PortReader(Worker):
         self._on_event = on_event
         self._carriers = {} if carriers is None else carriers
         self._is_replay = url.startswith(f"{REPLAY_SCHEME}://")
-        live = Connection(url, baud, on_event, root)
-        self._connection: Source = ReplaySource(url, playback) if self._is_replay else live
+        self.connection = (
+            ReplaySource(url, playback)
+            if self._is_replay
+            else Connection(url, baud, on_event, root)
+        )
         self._liveness = Liveness(protocol.says_hello, protocol.patience_s)
-        self._protocol = protocol
+        self.protocol = protocol
         self._pass = 0  # of the replay
         self._recording = 0  # number of the recording that has the last chunk
         self._preamble_s = 0.0  # when a recording was last given one
@@ -134,29 +136,9 @@ class PortReader(Worker):
         self._unanswered_s: float | None = None  # since when no command has been acknowledged
 
     @property
-    def counts(self) -> DecoderCounts:
-        """What the protocol has understood so far, and what not."""
-        return self._protocol.counts
-
-    @property
-    def has_clock(self) -> bool:
-        """Whether the device says when its scans were taken."""
-        return self._protocol.has_clock
-
-    @property
-    def protocol(self) -> str:
-        """What its device speaks."""
-        return self._protocol.name
-
-    @property
     def is_open(self) -> bool:
         """Whether the device is there at present."""
-        return self._connection.is_open
-
-    @property
-    def latency_timer_ms(self) -> int | None:
-        """How long an FTDI adapter holds bytes back; None for other ports."""
-        return self._connection.latency_timer_ms
+        return self.connection.is_open
 
     @property
     def state(self) -> str:
@@ -173,43 +155,36 @@ class PortReader(Worker):
     @property
     def problem(self) -> str:
         """Why the port is closed or of no use, for people; empty where all is well."""
-        return self._connection.problem or self.refusal or self._trouble(self._liveness.state)
+        return self.connection.problem or self.refusal or self._trouble(self._liveness.state)
 
     def open(self, or_wait: bool = False) -> None:
-        """Open the port.
-
-        Args:
-            or_wait: where that cannot be done yet, say why and let the thread try again.
-
-        Raises:
-            PortError, RecordingError: the port cannot be opened, and nobody is to wait for it.
-        """
+        """Open the port; raise PortError or RecordingError, unless the thread is to wait for it."""
         if or_wait:
-            self._connection.try_open()
+            self.connection.try_open()
         else:
-            self._connection.open()
+            self.connection.open()
 
     def zero_counters(self) -> None:
         """Ask the device to count from 0 again and to scan; for any thread."""
         self._is_zeroing.set()
 
     def _close(self) -> None:
-        self._connection.close()
+        self.connection.close()
 
     def _run(self) -> None:
-        if self._connection.is_open:
+        if self.connection.is_open:
             self._greet_newcomer()
         while not self._stopping.is_set():
             self.turns += 1
-            if not self._connection.is_open:
+            if not self.connection.is_open:
                 self._wait_for_device()
                 continue
             self._read_once()
-        self._send(self._protocol.stop())
+        self._send(self.protocol.stop())
 
     def _read_once(self) -> None:
         """Wait for bytes, for a bounded time, and pass on what they hold."""
-        source = self._connection
+        source = self.connection
         data = source.read()
         # The clocks are read here, before anything else is done with the bytes.
         realtime_ns, monotonic_ns = wall_clock_ns(), time.monotonic_ns()
@@ -219,12 +194,12 @@ class PortReader(Worker):
             self._take(data, realtime_ns, monotonic_ns, source.clock_ns(monotonic_ns))
         if source.has_ended and not self.has_ended:
             self._end()
-        if not self._is_replay and self._connection.is_open:
+        if not self._is_replay and self.connection.is_open:
             self._attend(monotonic_ns * 1e-9)
 
     def _wait_for_device(self) -> None:
         """Try the port once more, after a while."""
-        if not self._stopping.wait(RETRY_S) and self._connection.try_open():
+        if not self._stopping.wait(RETRY_S) and self.connection.try_open():
             self._tell("port_back")
             self._greet_newcomer()
 
@@ -233,7 +208,7 @@ class PortReader(Worker):
         self._is_known = False
         self._unanswered_s = None
         self._companions.forget()
-        self._protocol.restart()
+        self.protocol.restart()
         self._liveness.opened(time.monotonic())
         self._ask()
 
@@ -243,7 +218,7 @@ class PortReader(Worker):
             self._ask()
         if self._is_zeroing.is_set():
             self._is_zeroing.clear()
-            self._send(self._protocol.zero_counters())
+            self._send(self.protocol.zero_counters())
         self._tell_trouble(self._liveness.judge(now_s))
         self._tell_unanswered(now_s)
         if self._liveness.is_reopening_due(now_s):
@@ -252,14 +227,14 @@ class PortReader(Worker):
     @property
     def _ask_after_s(self) -> float:
         """Asking begins some foreign devices' scans anew: those that are slow get their time."""
-        least_s = self._protocol.patience_s
-        return least_s if self._protocol.says_hello else max(least_s, self._liveness.patience_s)
+        least_s = self.protocol.patience_s
+        return least_s if self.protocol.says_hello else max(least_s, self._liveness.patience_s)
 
     def _reopen(self) -> None:
         """Close and open the port: what a USB bridge that hangs often needs."""
-        self._connection.close()
-        self._protocol.restart()
-        if self._connection.try_open():
+        self.connection.close()
+        self.protocol.restart()
+        if self.connection.try_open():
             self.reopened += 1
             self._liveness.reopened(time.monotonic())
             self._ask()
@@ -269,8 +244,8 @@ class PortReader(Worker):
         recording = self._record(data, realtime_ns, monotonic_ns)
         scans = []
         now_s, found = monotonic_ns * 1e-9, 0
-        understood = self.counts.packets + self.counts.faulty
-        packets = self._protocol.feed(data)
+        understood = self.protocol.counts.packets + self.protocol.counts.faulty
+        packets = self.protocol.feed(data)
         for packet in packets:
             volts = self._handle(packet, now_s)
             found += isinstance(packet, Scan) and self._is_known and self._fault_s != now_s
@@ -288,19 +263,19 @@ class PortReader(Worker):
                         recording,
                         self.index,
                         self.clock.date(packet.channel, packet.device_us, clock_ns)
-                        if self.has_clock
+                        if self.protocol.has_clock
                         else None,
                         self._companions.at(packet.device_us),
                     )
                 )
-        intact = self.counts.packets + self.counts.faulty - understood
+        intact = self.protocol.counts.packets + self.protocol.counts.faulty - understood
         self._liveness.heard(now_s, intact, found)
         if packets:
             self._deliver(
                 Delivery(self.index, clock_ns, tuple(scans), self.hello, replay_pass=self._pass)
             )
         if not self._is_replay:
-            self._send(self._protocol.replies())
+            self._send(self.protocol.replies())
         self._tell_corrupt()
         self._tell_faulty(now_s)
         self._tell_clock()
@@ -320,9 +295,9 @@ class PortReader(Worker):
     def _record_to(self, active: ActiveRecording, data: bytes, times: tuple[int, int]) -> bool:
         entries = [port_entry(self.index, data, *times)]
         age_s = times[0] * 1e-9 - self._preamble_s
-        if active.number != self._recording or age_s >= self._protocol.preamble_period_s:
+        if active.number != self._recording or age_s >= self.protocol.preamble_period_s:
             # So that its first scan is whole and what it means is known.
-            preamble = self._protocol.preamble()
+            preamble = self.protocol.preamble()
             self._preamble_s = times[0] * 1e-9
             if preamble:
                 entries.insert(0, preamble_entry(self.index, preamble, *times))
@@ -447,15 +422,15 @@ class PortReader(Worker):
     def _ask(self) -> None:
         """Ask the device who it is and to start."""
         self._asked_s = time.monotonic()
-        self._send(self._protocol.introduction())
+        self._send(self.protocol.introduction())
 
     def _send(self, messages: list[bytes]) -> None:
         """Write to the device what it takes; while it is talked to, it is not asked anew."""
         for message in messages:
             self._asked_s = time.monotonic()
-            if not self._connection.is_open or not self._connection.write(message):
+            if not self.connection.is_open or not self.connection.write(message):
                 return
-            if self._protocol.acknowledges and self._unanswered_s is None:
+            if self.protocol.acknowledges and self._unanswered_s is None:
                 self._unanswered_s = self._asked_s
 
     def _trouble(self, state: DeviceState) -> str:
@@ -464,7 +439,9 @@ class PortReader(Worker):
         if state is DeviceState.SILENT:
             return f"nothing came for {self._liveness.silence_s:.3g} s"
         if state is DeviceState.GARBAGE:
-            return f"bytes come, but no packet of protocol {self.protocol} at {self._baud} baud"
+            return (
+                f"bytes come, but no packet of protocol {self.protocol.name} at {self._baud} baud"
+            )
         if state is DeviceState.IDLE and self._has_fault:
             return self._fault
         if state is DeviceState.IDLE and (hello is None or hello.scan_rate_hz > 0):
@@ -513,7 +490,7 @@ class PortReader(Worker):
         """Go on elsewhere in the recording: what had begun to come is not finished."""
         self._pass, self.has_ended = number, False
         self._companions.forget()
-        self._protocol.restart()
+        self.protocol.restart()
         self.clock = DeviceClock()
         self._clock_seen = (self.clock.state, 0)
 
@@ -540,7 +517,7 @@ class PortReader(Worker):
 
     def _tell_protocols_trouble(self) -> None:
         """Tell why nothing can be made of what comes, and when it can again."""
-        trouble = self._protocol.trouble
+        trouble = self.protocol.trouble
         if trouble == self._trouble_of_protocol:
             return
         if trouble is not None:
@@ -553,7 +530,7 @@ class PortReader(Worker):
         self._trouble_of_protocol = trouble
 
     def _tell_corrupt(self) -> None:
-        corrupt = self.counts.damaged
+        corrupt = self.protocol.counts.damaged
         if corrupt > self._corrupt_seen:
             self._tell(
                 "corrupt_packets",
@@ -563,9 +540,9 @@ class PortReader(Worker):
         self._corrupt_seen = corrupt
 
     def _tell_faulty(self, now_s: float) -> None:
-        faulty = self.counts.faulty
-        if faulty > self._faulty_seen and self._protocol.fault:
-            self._note_fault(self._protocol.fault, now_s)
+        faulty = self.protocol.counts.faulty
+        if faulty > self._faulty_seen and self.protocol.fault:
+            self._note_fault(self.protocol.fault, now_s)
         self._faulty_seen = faulty
 
 

@@ -16,7 +16,6 @@ nowhere: a recording does not answer.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Protocol
 
 from tactomo.acquisition.open_serial import READ_TIMEOUT_S
 from tactomo.recordings.playback import Playback
@@ -24,48 +23,13 @@ from tactomo.recordings.recording import Chunk, Recording
 from tactomo.recordings.replay import parse_replay_url
 
 
-class Source(Protocol):
-    """Where a port's bytes come from: a `Connection` to a device, or a recording.
-
-    Attributes:
-        is_open: whether it is there at present.
-        problem: why not, for people; empty while it is.
-        latency_timer_ms: how long an FTDI adapter holds bytes back; None for others.
-        has_ended: whether all there is was read.
-        moved: how often what comes next has not gone on from what came before.
-    """
-
-    is_open: bool
-    problem: str
-    latency_timer_ms: int | None
-    has_ended: bool
-    moved: int
-
-    def open(self) -> None:
-        """Open it; raise PortError or RecordingError where that cannot be done."""
-
-    def try_open(self) -> bool:
-        """Open it, if that can be done; otherwise say why not, once for each reason."""
-
-    def read(self) -> bytes:
-        """Wait for bytes for a bounded time."""
-
-    def clock_ns(self, monotonic_ns: int) -> int:
-        """When the bytes just read came, on the steady clock of their own, if they have one."""
-
-    def write(self, data: bytes) -> bool:
-        """Send bytes; return whether they were taken."""
-
-    def close(self) -> None:
-        """Close it; may be called twice."""
-
-
 class ReplaySource:
-    """A recorded port as a `Source`."""
+    """A recorded port, to be used as a `Connection` is."""
 
     def __init__(self, url: str, playback: Playback | None) -> None:
         self.is_open = self.has_ended = False
-        self.problem, self.moved = "", 0
+        self.problem = ""
+        self.moved = 0  # how often what comes next has not gone on from what came before
         self.latency_timer_ms: int | None = None
         self._url = url
         self._given = playback  # the replay's time; None for one of its own

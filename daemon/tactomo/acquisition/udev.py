@@ -46,10 +46,7 @@ def find(port: str, adapters: list[Adapter]) -> Adapter | None:
 
 
 def rule(mark: str, adapter: Adapter, adapters: list[Adapter]) -> list[str]:
-    """Return the lines that mark a USB adapter.
-
-    Raises ServiceError where it can be known by nothing.
-    """
+    """Return the lines that mark a USB adapter; raise ServiceError where nothing identifies it."""
     is_told_apart = not look_alikes(adapter, adapters)
     if _PLAIN.fullmatch(adapter.serial_number) and is_told_apart:
         return _by_serial_number(mark, adapter)

@@ -82,10 +82,7 @@ class Child:
         return self._process.wait()
 
     def wait_ready(self) -> Mapping[str, Any]:
-        """Return what the child announced when it was ready.
-
-        Raises ChildError where it ended before, or takes too long.
-        """
+        """Return what the child announced; raise ChildError where it ended or takes too long."""
         if not self._changed.wait(START_S):
             raise ChildError(
                 f"the {self.name} was not ready after {START_S:g} s", self._last_lines()

@@ -18,10 +18,7 @@ def not_installed(what: str) -> TactomoError:
 
 
 def measurement(name: str) -> Any:
-    """Return the function that the laboratory adds to `tactomo bench` under a name.
-
-    Raises TactomoError where the laboratory is not installed.
-    """
+    """Return the laboratory's function of this name for `tactomo bench`, or raise TactomoError."""
     from importlib.metadata import entry_points
 
     for entry in entry_points(group=BENCH, name=name):

@@ -25,14 +25,8 @@ class SensorError(TactomoError):
 def find_sensor(name: str | None, address: str | None, keys: Path | None = None) -> Running:
     """Return the sensor that is meant: the only one there is, where it is not named.
 
-    Args:
-        name: the sensor's; None for the only one.
-        address: of a stream that carries the sensor; None for those that run on this computer.
-        keys: the folder of keys for that address.
-
-    Raises:
-        SensorError: there is none, or there are several.
-        KeysError: the server lets nobody in by these keys.
+    Without an `address` of a stream, those that run on this computer count. Raises SensorError
+    where none or several may be meant, and KeysError where the server lets nobody in by `keys`.
     """
     if address is not None:
         return _heard_of(name, address, keys)
@@ -92,11 +86,7 @@ def name_of(name: str | None) -> str:
 
 
 def find_twin(address: str | None) -> str:
-    """Return the address of the twin's control socket: the only one's that runs, if none is given.
-
-    Raises:
-        SensorError: none runs, or several do.
-    """
+    """Return the control address of the twin; raise SensorError where none or several run."""
     if address is not None:
         return address
     there = running("twin")

@@ -188,22 +188,23 @@ def taught_fields(taught: TaughtSkin) -> dict[str, Any]:
 
 def port_fields(port: PortReader) -> dict[str, Any]:
     """Return what `status` says about a port."""
+    counts = port.protocol.counts
     return {
         "url": port.url,
-        "protocol": port.protocol,
+        "protocol": port.protocol.name,
         "connected": port.is_open,
         "state": port.state,
         "problem": port.problem or None,
         "device": port.hello and device_fields(port.hello),
         "refusal": port.refusal or None,
         "bytes": port.bytes_read,
-        "packets": port.counts.packets,
-        "corrupt": port.counts.damaged,
-        "faulty": port.counts.faulty,
+        "packets": counts.packets,
+        "corrupt": counts.damaged,
+        "faulty": counts.faulty,
         "unused_scans": port.unused,
         "reopened": port.reopened,
-        "latency_timer_ms": port.latency_timer_ms,
-        "clock": _clock(port.clock, port.has_clock),
+        "latency_timer_ms": port.connection.latency_timer_ms,
+        "clock": _clock(port.clock, port.protocol.has_clock),
     }
 
 

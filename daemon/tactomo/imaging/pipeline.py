@@ -55,23 +55,9 @@ class _SyncState(NamedTuple):
 class Pipeline(Worker):
     """`start` it, `deliver` to it, `stop` it.
 
-    Args:
-        imaging: takes the dual scans; it belongs to this thread from `start` on.
-        channels: those that the sensor has.
-        ports: how many ports deliver.
-        sync_wait_ns: how long a scan waits for its partner.
-        is_lossless: reconstruct every dual scan, however late.
-        replay: what the recording says, where the ports replay one.
-        zero_counters: asks every device to count from 0 again.
-        on_event: told what happens to scans and channels.
-
     Attributes:
-        sync: pairs the scans; it counts those that it drops.
-        skew: how far apart the channels are.
-        wall_clock: whether it was set.
         delivered_ns: when the newest scan was delivered, monotonic; 0 before the first.
         incomplete: dual scans of which one channel did not come that had come before, or is lost.
-        scan_rates: how often each channel's scans come.
         finished: set while every replayed port is at its end, once what came of it was published.
     """
 

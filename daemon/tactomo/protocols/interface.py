@@ -20,6 +20,7 @@ from tactomo_protocol import (
     MAX_DEVICE_US,
     MAX_SAMPLES,
     SCAN_COUNTERS,
+    Channel,
     CompanionReading,
     Decoder,
     DecoderCounts,
@@ -56,6 +57,29 @@ def check_scan_fits(description: SensorDescription) -> None:
         )
 
 
+def hello_of(
+    description: SensorDescription,
+    channels: tuple[Channel, ...],
+    device_id: str,
+    firmware: str,
+    rate_hz: float,
+    sample_format: SampleFormat = SampleFormat.FLOAT32,
+    volts_per_count: float = 1.0,
+) -> Hello:
+    """Return what a device that measures this sensor says of itself."""
+    return Hello(
+        device_id,
+        firmware,
+        channels,
+        description.electrode_count,
+        *description.offsets,
+        description.measurements,
+        sample_format,
+        volts_per_count,
+        rate_hz,
+    )
+
+
 class PortProtocol:
     """A language of devices, as one port speaks it; a subclass decodes with `feed`."""
 
@@ -74,6 +98,9 @@ class PortProtocol:
     counts: DecoderCounts  #: what was understood and what was not, over all connections
     #: why scans cannot be used at present; None where they can, or none came yet
     trouble: Trouble | None = None
+
+    def __init__(self, description: SensorDescription | None) -> None:
+        """Raise ConfigError where the protocol cannot carry the sensor."""
 
     @classmethod
     def recognises(cls, data: bytes) -> bool:
@@ -237,19 +264,8 @@ class ForeignProtocol(PortProtocol):
 
     def hello(self) -> Hello:
         """Return what the device would say of itself if it spoke our protocol."""
-        drive_offset, measure_offset = self.description.offsets
-        return Hello(
-            device_id=self.device_id,
-            firmware=f"protocol {self.name}",
-            channels=(self._channel,),
-            electrodes=self.description.electrode_count,
-            drive_offset=drive_offset,
-            measure_offset=measure_offset,
-            samples_per_scan=self.description.measurements,
-            sample_format=SampleFormat.FLOAT32,
-            volts_per_count=1.0,
-            scan_rate_hz=self._rate_hz,
-        )
+        firmware = f"protocol {self.name}"
+        return hello_of(self.description, (self._channel,), self.device_id, firmware, self._rate_hz)
 
     def _scan(self, reading: Reading) -> Scan:
         samples = np.asarray(reading.volts, dtype=np.float32)

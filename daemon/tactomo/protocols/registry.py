@@ -17,7 +17,7 @@ import importlib
 from collections.abc import Callable
 from functools import cache
 from importlib.metadata import entry_points
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from tactomo_models import SensorDescription
 
@@ -29,21 +29,7 @@ NATIVE: Final = "tactomo"  # the protocol of `firmware_protocol/PROTOCOL.md`
 WHERE: Final = "run in its folder, or set PYTHONPATH"
 _MEMBERS: Final = ("name", "baud", "recognises", "feed", "introduction", "preamble")
 
-_named: dict[str, ProtocolClass] = {}  # by `name`: classes that the user named at the start
-
-
-class ProtocolClass(Protocol):
-    """The class of a protocol: what is registered."""
-
-    name: str
-    baud: int
-    emulator: str
-
-    def __call__(self, description: SensorDescription | None) -> PortProtocol:
-        """Return the protocol of one port; raise ConfigError where it cannot carry the sensor."""
-
-    def recognises(self, data: bytes) -> bool:
-        """Tell whether bytes from anywhere in a stream are likely of this protocol."""
+_named: dict[str, type[PortProtocol]] = {}  # by `name`: classes that the user named at the start
 
 
 def available_protocols() -> tuple[str, ...]:
@@ -51,18 +37,14 @@ def available_protocols() -> tuple[str, ...]:
     return tuple(sorted({*_installed(), *_named}, key=lambda name: (name != NATIVE, name)))
 
 
-def find_protocol(name: str) -> ProtocolClass:
-    """Return the protocol that whoever starts the program gave: a name or `my_module:MyProtocol`.
-
-    Raises:
-        ConfigError: there is no such protocol, or it cannot be imported.
-    """
+def find_protocol(name: str) -> type[PortProtocol]:
+    """Return the protocol of a name or of `my_module:MyProtocol`, or raise ConfigError."""
     if ":" not in name:
         return _registered(name)
     from tactomo_models.methods.registry import search_working_folder  # takes a second to import
 
     search_working_folder()
-    found: ProtocolClass = _load(name)
+    found: type[PortProtocol] = _load(name)
     missing = [member for member in _MEMBERS if not hasattr(found, member)]
     if missing or not isinstance(found, type):
         raise ConfigError(
@@ -78,15 +60,9 @@ def find_protocol(name: str) -> ProtocolClass:
 
 
 def protocol_named(name: str, description: SensorDescription | None) -> PortProtocol:
-    """Return the protocol of that name, for one port.
+    """Return the protocol of that name, for one port; the native one needs no description.
 
-    Args:
-        name: one of `available_protocols`.
-        description: the sensor's. The native protocol does without; foreign devices do not say
-            what they measure.
-
-    Raises:
-        ConfigError: there is no such protocol, or it cannot carry the description's channels.
+    Raises ConfigError where there is no such protocol, or it cannot carry the sensor's channels.
     """
     kind = _registered(name)
     try:
@@ -102,11 +78,7 @@ def protocol_named(name: str, description: SensorDescription | None) -> PortProt
 
 
 def emulator_of(name: str) -> Callable[[SensorDescription, float], Any]:
-    """Return what the twin emulates a protocol's device with, see `tactomo.twin.foreign`.
-
-    Raises:
-        ConfigError: the protocol names none, or the one that it names cannot be imported.
-    """
+    """Return what the twin plays a protocol's device with, see `Emulator`; ConfigError for none."""
     path = _registered(name).emulator
     if not path:
         raise ConfigError(
@@ -128,7 +100,7 @@ def recognised(data: bytes) -> str | None:
     return None
 
 
-def _registered(name: str) -> ProtocolClass:
+def _registered(name: str) -> type[PortProtocol]:
     if name in _named:
         return _named[name]
     if name not in _installed():
@@ -137,7 +109,7 @@ def _registered(name: str) -> ProtocolClass:
             f"use one of: {', '.join(available_protocols())}; or one of your own, as "
             "my_module:MyProtocol",
         )
-    kind: ProtocolClass = _load(_installed()[name])
+    kind: type[PortProtocol] = _load(_installed()[name])
     return kind
 
 

@@ -44,11 +44,7 @@ class _Frame(NamedTuple):
 
 
 def eit_files(folder: Path) -> list[Path]:
-    """Return the .eit files in a folder, by name.
-
-    Raises:
-        EitFileError: there is none.
-    """
+    """Return the .eit files in a folder, by name; raise EitFileError where there is none."""
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() == SUFFIX)
     if not found:
         raise EitFileError(f"{folder} holds no {SUFFIX} file", "give the folder that has them")

@@ -39,9 +39,10 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.batch import all_nan, checked, companions_of, scans_of
 from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
 from tactomo_models.sensor.pattern import rim_signs, touching
-from tactomo_protocol import Channel, CompanionReading, Hello, SampleFormat, Scan, ScanFlag
+from tactomo_protocol import Channel, CompanionReading, Hello, Scan, ScanFlag
 
 from tactomo.errors import TactomoError, os_errors_as
+from tactomo.protocols.interface import hello_of
 from tactomo.recordings.eit_files import SUFFIX, eit_files, read_eit_files
 from tactomo.scans import MAX_QUADRATURE
 
@@ -87,11 +88,7 @@ class Scans:
         return len(next(iter(self.volts.values())))
 
     def times(self, rate_hz: float | None) -> FloatArray:
-        """Return when each scan was taken, (T,) seconds from 0: by rate, or the file's own.
-
-        Raises:
-            ImportFileError: neither is known, or no device has that rate.
-        """
+        """Return (T,) seconds from 0, by rate or the file's own; else raise ImportFileError."""
         if rate_hz is not None:
             if not SLOWEST_HZ <= rate_hz <= FASTEST_HZ:
                 raise ImportFileError(
@@ -153,19 +150,8 @@ class Scans:
 
     def hello(self, description: SensorDescription, rate_hz: float) -> Hello:
         """Return what the device that took these scans would have said of itself."""
-        drive_offset, measure_offset = description.offsets
-        return Hello(
-            device_id="import",
-            firmware="tactomo import",
-            channels=tuple(sorted(self.volts)),
-            electrodes=description.electrode_count,
-            drive_offset=drive_offset,
-            measure_offset=measure_offset,
-            samples_per_scan=description.measurements,
-            sample_format=SampleFormat.FLOAT32,
-            volts_per_count=1.0,
-            scan_rate_hz=rate_hz,
-        )
+        channels = tuple(sorted(self.volts))
+        return hello_of(description, channels, "import", "tactomo import", rate_hz)
 
 
 def read_scans(
@@ -246,14 +232,9 @@ def _turned_round(scans: Scans, description: SensorDescription) -> Scans:
 
 
 def load_arrays(path: Path | Sequence[Path]) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an .npz file by name, or those that .eit files amount to.
+    """Return the arrays of a file by name, or those that .eit files or a folder of them amount to.
 
-    Args:
-        path: one file; a folder of .eit files; or a list of them.
-
-    Raises:
-        ImportFileError, EitFileError: it cannot be read.
-        DataError: it is no .npz file of numbers.
+    Raises ImportFileError or EitFileError where it cannot be read, DataError without numbers.
     """
     given = [path] if isinstance(path, Path) else path
     files = [file for each in given for file in (eit_files(each) if each.is_dir() else [each])]

@@ -16,21 +16,12 @@ MAX_LAG_S: Final = 0.25
 
 
 class Playback:
-    """For use by any thread.
-
-    Args:
-        start_ns: when the recording begins.
-        end_ns: when it ends.
-        speed: factor of the recorded speed, or 0 for as fast as it is taken.
-
-    Attributes:
-        begin_ns: where the pass began.
-        maps_before: how many maps were published before it began.
-    """
+    """Where a replay is, for any thread; speed 0 is as fast as it is taken."""
 
     def __init__(self, start_ns: int, end_ns: int, speed: float) -> None:
-        self.passes = self.maps_before = 0  # passes: how often it was moved
-        self.start_ns = self.begin_ns = start_ns
+        self.passes = 0  # how often it was moved
+        self.maps_before = 0  # how many maps were published before this pass
+        self.start_ns = self.begin_ns = start_ns  # of the recording; of this pass
         self.loops = False  # whether the end is followed by the beginning
         self.waits_for_page = False  # whether it is paused until somebody looks
         self._end_ns = end_ns

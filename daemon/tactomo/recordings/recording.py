@@ -253,12 +253,7 @@ class Recording:
 
 
 def open_recording(path: str | Path) -> Recording:
-    """Open a recording.
-
-    Raises:
-        RecordingError: there is no such file, or it is no recording of tactomo's. A file that is
-            cut off is no error: see `Summary.is_complete`.
-    """
+    """Open a recording, whole or cut off; raise RecordingError where it is none of tactomo's."""
     return Recording(Path(path))
 
 

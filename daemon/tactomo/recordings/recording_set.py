@@ -58,10 +58,7 @@ class RecordingSet(Recording):
         return self.parts[-1].span.end_ns + self._shifts_ns[-1]
 
     def chunks(self, port: int, from_ns: int = 0) -> Iterator[Chunk]:
-        """Yield what port `port` said from a time on; before all else a preamble, if there is one.
-
-        What came between the preamble and that time comes with it, at that time.
-        """
+        """Yield what port `port` said from a time on, as `Recording.chunks` does."""
         before: frozenset[int] = frozenset()
         for part, shift_ns in zip(self.parts, self._shifts_ns, strict=True):
             if part.span.end_ns + shift_ns >= from_ns or part is self.parts[-1]:
@@ -106,10 +103,7 @@ class RecordingSet(Recording):
 
 
 def open_replayable(path: str | Path) -> Recording:
-    """Open a recording, or a folder of those that a daemon has cut.
-
-    Raises RecordingError where it is neither.
-    """
+    """Open a recording or a folder of cut ones; raise RecordingError where it is neither."""
     return RecordingSet(Path(path)) if Path(path).is_dir() else open_recording(path)
 
 

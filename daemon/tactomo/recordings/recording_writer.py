@@ -213,10 +213,7 @@ class RecordingWriter:
         self._writer.add_metadata(name, facts)
 
     def flush(self) -> int:
-        """Hand everything to the operating system, so that this process may be killed.
-
-        Returns the length of the file.
-        """
+        """Hand everything to the operating system, which outlives this process; return the size."""
         self._end_chunk()
         self._file.hand_over()
         return self._file.tell()
@@ -253,10 +250,7 @@ class RecordingWriter:
 
 
 def create(path: Path, origin: Origin) -> RecordingWriter:
-    """Begin a recording's file, in a folder that is there.
-
-    Raises RecordingError where the file exists or cannot be created.
-    """
+    """Begin a file in a folder that is there; raise RecordingError where that cannot be done."""
     try:
         return RecordingWriter(path, origin)
     except FileExistsError as error:

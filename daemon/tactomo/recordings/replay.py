@@ -101,10 +101,8 @@ class ReplayClock:
 def read_replay(urls: Sequence[str], description: SensorDescription) -> Replay | None:
     """Return what the recording says that the ports replay; None where they are live.
 
-    Raises:
-        ConfigError: only some of the ports are replayed, or not all from one recording, or that
-            is of another sensor.
-        RecordingError, PortError: a URL leads to no recording.
+    Raises ConfigError where not all ports replay one recording of this sensor, RecordingError or
+    PortError where a URL leads to no recording.
     """
     replayed = [url for url in urls if url.startswith(f"{REPLAY_SCHEME}://")]
     if not replayed:
@@ -139,12 +137,7 @@ def read_replay(urls: Sequence[str], description: SensorDescription) -> Replay |
 
 
 def parse_replay_url(url: str) -> tuple[Recording, int, float]:
-    """Return the recording, the port's number in it and the speed that a URL asks for.
-
-    Raises:
-        PortError: the URL is malformed or asks for a port that was not recorded.
-        RecordingError: its path is no recording.
-    """
+    """Return the recording, the port's number and the speed of a URL, or raise PortError."""
     parts = urlsplit(url)
     options = {"port": "0", "speed": "1", **dict(parse_qsl(parts.query))}
     try:

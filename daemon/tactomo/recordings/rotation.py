@@ -49,10 +49,7 @@ def next_path(folder: Path, sensor: str, now_s: float) -> Path:
 
 
 def list_recordings(folder: Path, sensor: str) -> list[KeptRecording]:
-    """Return a sensor's recordings in a folder, in the order in which they were made.
-
-    Raises OSError where the folder cannot be read.
-    """
+    """Return a sensor's recordings, the oldest first; raise OSError as folders do."""
     return sorted(_recordings(folder, sensor)) if folder.is_dir() else []
 
 

@@ -106,12 +106,7 @@ log = structlog.get_logger()
 class Daemon:
     """One sensor's daemon, to be run in this process.
 
-    Raises:
-        ModelError: the description or the artifact cannot be used.
-        ConfigError: the ports are not all live, or not all of one recording.
-        PortAbsentError: a port does not exist and `wait_for_ports` is off.
-        KeysError: the secret key cannot be used.
-        RecordingError, PortError: a replay URL leads to no recording.
+    Raises ModelError, ConfigError, KeysError, RecordingError or PortError for what is unusable.
     """
 
     def __init__(
@@ -265,11 +260,8 @@ class Daemon:
     def start(self) -> None:
         """Open everything and start all threads; on failure, what was opened is closed again.
 
-        Raises:
-            PortError: a port cannot be used and `wait_for_ports` is off; one that vanishes later
-                is waited for in any case.
-            AddressError: an address is in use.
-            RecordingError: the recording cannot be created.
+        Raises PortError where a port is unusable and `wait_for_ports` is off, AddressError where an
+        address is in use, and RecordingError where the recording cannot be created.
         """
         with contextlib.ExitStack() as undo:
             self._open(undo)

@@ -29,11 +29,7 @@ def obey(
     commands: Mapping[str, type[BaseModel]],
     handlers: Mapping[str, Callable[[Any], Outcome]],
 ) -> Outcome:
-    """Check a command's arguments, and return what its handler makes of them.
-
-    Raises:
-        CommandError: there is no such command, an argument is wrong, or the handler refuses.
-    """
+    """Check a command's arguments and return its handler's outcome, or raise CommandError."""
     if command not in commands:
         raise CommandError(
             f"unknown command {command[:40]!r}",

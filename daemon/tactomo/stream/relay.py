@@ -111,10 +111,7 @@ def waiting(socket: zmq.Socket[bytes]) -> Iterator[bytes]:
 
 
 def serve(relay: Relay) -> None:
-    """Open a relay, serve until a signal asks to end, and close it; for the main thread.
-
-    Raises what its `open` raises.
-    """
+    """Open a relay, serve until a signal asks to end, and close it; for the main thread."""
     at_end(lambda *_: relay.stop())
     allow_connections()
     try:

@@ -30,9 +30,7 @@ def open_session(
 ) -> zenoh.Session:
     """Open a Zenoh session as a configuration file has it; without one, at or to `LOCAL`.
 
-    Raises:
-        ConfigError: the file cannot be read, or is no configuration of Zenoh.
-        AddressError: an address of it cannot be listened on or connected to.
+    Raises ConfigError where the file is unusable, AddressError where an address of it is.
     """
     zenoh.init_log_from_env_or("error")
     try:
@@ -58,14 +56,7 @@ def open_session(
 
 
 class ZenohBridge(Relay):
-    """Publishes daemons' streams in Zenoh.
-
-    Args:
-        sources: addresses of the streams.
-        robot: under which name.
-        configuration: Zenoh's file; None: this computer alone.
-        keys: this bridge's own, for sources that want some.
-    """
+    """Publishes daemons' streams under a robot's name; `keys` are for sources that want some."""
 
     def __init__(
         self,
@@ -84,9 +75,7 @@ class ZenohBridge(Relay):
     def open(self) -> None:
         """Open Zenoh, and connect to the sources, whether or not they are there.
 
-        Raises:
-            AddressError, ConfigError: as `open_session` does.
-            ControlError: a source's address is not one.
+        Raises AddressError or ConfigError as `open_session` does, ControlError for a bad source.
         """
         self._session = open_session(self._configuration, "listen")
         self._publication = Publication(self._session, self._robot)

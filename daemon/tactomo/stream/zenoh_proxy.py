@@ -31,13 +31,7 @@ MAX_KEYS: Final = 256
 
 
 class ZenohProxy(Relay):
-    """One address of this computer for what Zenoh has.
-
-    Args:
-        robot: whose skins; ``*`` for every robot's.
-        endpoint: where to bind; no other computer may reach it.
-        configuration: Zenoh's file; None: this computer alone.
-    """
+    """One address of this computer for what a robot's skins send; ``*`` is every robot."""
 
     def __init__(self, robot: str, endpoint: str, configuration: Path | None = None) -> None:
         super().__init__([f"tactomo/{robot}"])
@@ -50,10 +44,8 @@ class ZenohProxy(Relay):
     def open(self) -> None:
         """Bind, and open Zenoh.
 
-        Raises:
-            AddressError: the address cannot be had, or can be reached from other computers; or as
-                `open_session` does.
-            ConfigError: as `open_session` does.
+        Raises AddressError where other computers can reach the address or it cannot be had, and as
+        `open_session` does.
         """
         self._outlet: zmq.Socket[bytes] = self._context.socket(zmq.XPUB)
         self._outlet.setsockopt(zmq.SNDHWM, QUEUED)

@@ -25,7 +25,7 @@ from pydantic import TypeAdapter, ValidationError
 from tactomo_client.messages import DEFAULT_TWIN_CONTROL
 from tactomo_models import Press, SensorDescription, SkinSimulator
 from tactomo_models.simulation.skin_drift import DriftingSkin, SkinDrift
-from tactomo_protocol import Channel, CompanionReading
+from tactomo_protocol import Channel, CompanionReading, SampleFormat
 from threadpoolctl import threadpool_limits
 
 from tactomo.config import Endpoint
@@ -33,6 +33,7 @@ from tactomo.endpoint import is_local
 from tactomo.errors import CommandError, ConfigError
 from tactomo.plain import counted
 from tactomo.protocols import NATIVE, check_scan_fits, emulator_of, find_protocol
+from tactomo.protocols.interface import hello_of
 from tactomo.stream.commands import Nothing, explained
 from tactomo.twin.companions import SimulatedCompanions
 from tactomo.twin.control import (
@@ -47,7 +48,7 @@ from tactomo.twin.control import (
     ReleaseArguments,
 )
 from tactomo.twin.converter import Converter
-from tactomo.twin.firmware import RATE_HZ_MAX, RATE_HZ_MIN, Firmware, Identity, Port, Voltages
+from tactomo.twin.firmware import RATE_HZ_MAX, RATE_HZ_MIN, Firmware, Port, Voltages
 from tactomo.twin.foreign import Emulator, ForeignFirmware
 from tactomo.twin.line import SerialLine
 from tactomo.twin.scene import Scene, SkinDriftSettings
@@ -143,14 +144,8 @@ class TwinConfig:
 class Twin:
     """A simulated sensor; its lines and its control socket are there from construction on.
 
-    Args:
-        config: its set-up.
-        skin: the forward model; by default the description's own, on a fine mesh, which takes
-            seconds to make.
-
-    Raises:
-        AddressError: the control socket cannot be bound.
-        TactomoError: the links cannot be made.
+    Its skin is by default made of the description, which takes seconds. Raises AddressError or
+    TactomoError where the control socket or the links cannot be had.
     """
 
     def __init__(self, config: TwinConfig, skin: SkinModel | None = None) -> None:
@@ -279,23 +274,23 @@ class Twin:
             self._drifting.drift = script.drift.skin_drift()
 
     def _make_firmware(self, ports: list[Port]) -> Firmware:
-        config = self.config
-        identity = _identity(config.description, config.protocol)
-        if config.protocol != NATIVE:
-            make = emulator_of(find_protocol(config.protocol).name)
-            emulator: Emulator = make(config.description, config.rate_hz)
-            return ForeignFirmware(
-                emulator, identity, ports[0], self._sample, self._converter, self._clock
-            )
-        return Firmware(
-            identity,
-            ports,
-            self._sample,
-            self._converter,
+        config, device = self.config, self.config.description.name
+        is_foreign = config.protocol != NATIVE
+        protocol = find_protocol(config.protocol).name
+        hello = hello_of(
+            config.description,
+            config.description.channels,
+            f"twin-{f'{protocol}-' if is_foreign else ''}{device}"[:64],
+            f"tactomo-twin {version('tactomo')}",
             config.rate_hz,
-            self._clock,
-            self._read_companions,
+            SampleFormat.INT32,
+            self._converter.volts_per_count,
         )
+        behind = (self._sample, self._converter, self._clock)
+        if is_foreign:
+            emulator: Emulator = emulator_of(protocol)(config.description, config.rate_hz)
+            return ForeignFirmware(emulator, hello, ports[0], *behind)
+        return Firmware(hello, ports, *behind, self._read_companions)
 
     def _make_converter(self) -> Converter:
         unloaded = self._skin.voltages([])
@@ -326,7 +321,7 @@ class Twin:
     def _status(self, _: Nothing) -> dict[str, Any]:
         firmware = self._firmware
         return {
-            "device_id": firmware.identity.device_id,
+            "device_id": firmware.hello.device_id,
             "sensor": self.config.description.name,
             "rate_hz": firmware.rate_hz,
             "counter": firmware.counter,
@@ -424,21 +419,6 @@ class Twin:
         if number >= len(ports):
             raise CommandError(f"there is no port {number}", f"the last one is {len(ports) - 1}")
         return [ports[number]]
-
-
-def _identity(description: SensorDescription, protocol: str) -> Identity:
-    drive_offset, measure_offset = description.offsets
-    device = description.name
-    if protocol != NATIVE:
-        device = f"{find_protocol(protocol).name}-{device}"
-    return Identity(
-        device_id=f"twin-{device}"[:64],
-        firmware=f"tactomo-twin {version('tactomo')}",
-        electrodes=description.electrode_count,
-        drive_offset=drive_offset,
-        measure_offset=measure_offset,
-        measurements=description.measurements,
-    )
 
 
 def _wiring(config: TwinConfig) -> dict[str, tuple[Channel, ...]]:

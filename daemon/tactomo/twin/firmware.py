@@ -15,7 +15,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from tactomo_models.arrays import FloatArray
 from tactomo_protocol import (
@@ -27,7 +27,6 @@ from tactomo_protocol import (
     CompanionReading,
     Decoder,
     Hello,
-    SampleFormat,
     Scan,
     ScanFlag,
     encode,
@@ -53,18 +52,6 @@ class Port:
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
-    """What the device says of itself in every hello."""
-
-    device_id: str
-    firmware: str
-    electrodes: int
-    drive_offset: int
-    measure_offset: int
-    measurements: int
-
-
-@dataclass(frozen=True, slots=True)
 class Sample:
     """A scan in the making: sampled at `time_s`, its voltages still being computed."""
 
@@ -83,17 +70,16 @@ class Firmware:
 
     def __init__(
         self,
-        identity: Identity,
+        hello: Hello,  # as of all channels and the rate at first
         ports: Sequence[Port],
         sample: Callable[[float], Future[Voltages]],
         converter: Converter,
-        rate_hz: float,
         clock: Callable[[], float],
         read: Callable[[float, int], Sequence[CompanionReading]] = lambda _, __: (),
     ) -> None:
-        self.identity = identity
+        self.hello = hello
         self.ports = tuple(ports)
-        self.rate_hz = rate_hz
+        self.rate_hz = hello.scan_rate_hz
         self.counter = 0
         self.late = 0
         self._sample = sample
@@ -219,19 +205,7 @@ class Firmware:
 
     def _greet(self, ports: Sequence[Port]) -> None:
         for port in ports:
-            port.line.send(encode(self._hello(port)))
-
-    def _hello(self, port: Port) -> Hello:
-        return Hello(
-            device_id=self.identity.device_id,
-            firmware=self.identity.firmware,
-            channels=port.channels,
-            electrodes=self.identity.electrodes,
-            drive_offset=self.identity.drive_offset,
-            measure_offset=self.identity.measure_offset,
-            samples_per_scan=self.identity.measurements,
-            sample_format=SampleFormat.INT32,
-            volts_per_count=self._converter.volts_per_count,
             # A follower's pulses come from the leader.
-            scan_rate_hz=self.rate_hz if port is self.ports[0] else 0.0,
-        )
+            rate_hz = self.rate_hz if port is self.ports[0] else 0.0
+            hello = replace(self.hello, channels=port.channels, scan_rate_hz=rate_hz)
+            port.line.send(encode(hello))

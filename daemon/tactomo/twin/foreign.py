@@ -16,10 +16,10 @@ from typing import Protocol
 import numpy as np
 from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray
-from tactomo_protocol import Channel, ScanFlag
+from tactomo_protocol import Channel, Hello, ScanFlag
 
 from tactomo.twin.converter import Converter
-from tactomo.twin.firmware import Firmware, Identity, Port, Sample, Voltages
+from tactomo.twin.firmware import Firmware, Port, Sample, Voltages
 
 MAX_WAITING_BYTES = 1 << 17
 """What an instrument keeps for a host that is slow to take it; then frames are lost."""
@@ -80,13 +80,13 @@ class ForeignFirmware(Firmware):
     def __init__(
         self,
         emulator: Emulator,
-        identity: Identity,
+        hello: Hello,
         port: Port,
         sample: Callable[[float], Future[Voltages]],
         converter: Converter,
         clock: Callable[[], float],
     ) -> None:
-        super().__init__(identity, [port], sample, converter, emulator.rate_hz, clock)
+        super().__init__(hello, [port], sample, converter, clock)
         self._emulator = emulator
         self._port = port
         self._waiting: deque[bytes] = deque()

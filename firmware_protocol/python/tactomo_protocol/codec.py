@@ -12,7 +12,9 @@ import math
 import operator
 import re
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -43,14 +45,6 @@ MIN_RATE_HZ, MAX_RATE_HZ = 1e-3, 1e6
 """A scan in 1000 s, which C's 32-bit timer still spans; one a microsecond, the clock's unit."""
 
 _SCAN, _HELLO, _ACKNOWLEDGE, _COMPANION, _COMMAND = 0x01, 0x02, 0x03, 0x04, 0x81
-_KNOWN_TYPES = {
-    _SCAN: "scan",
-    _HELLO: "hello",
-    _ACKNOWLEDGE: "acknowledge",
-    _COMPANION: "companion",
-    _COMMAND: "command",
-}
-
 # Each layout starts with the version and the type, as the payload does.
 _PREFIX = struct.Struct("<BB")
 _SCAN_HEAD = struct.Struct("<BBBBIQBBH")
@@ -186,45 +180,22 @@ class Decoder:
             return None
         if kind not in _KNOWN_TYPES:
             self.counts.unknown_type += 1
+            return UnknownPacket(kind, content[_PREFIX.size :])
+        name, unpack = _KNOWN_TYPES[kind]
         try:
-            return _unpack(kind, content)
-        except ValueError as error:
+            return unpack(content)
+        except ValueError as error:  # a body that breaks the specification
             self.counts.malformed += 1
-            self.fault = f"{_KNOWN_TYPES[kind]} packet: {error}"
+            self.fault = f"{name} packet: {error}"
             return None
 
 
 def _pack(packet: Packet) -> bytes:
-    match packet:
-        case Scan():
-            return _pack_scan(packet)
-        case Hello():
-            return _pack_hello(packet)
-        case Acknowledge():
-            return _pack_acknowledge(packet)
-        case CompanionReading():
-            return _pack_companion(packet)
-        case Command():
-            return _pack_command(packet)
-        case UnknownPacket():
-            return _pack_unknown(packet)
-    allowed = "a Scan, Hello, Acknowledge, CompanionReading, Command or UnknownPacket"
-    raise FieldError("packet", packet, allowed)
-
-
-def _unpack(kind: int, content: bytes) -> Packet:
-    """The packet in `content` (version, type, body); raises ValueError if the body is malformed."""
-    if kind == _SCAN:
-        return _unpack_scan(content)
-    if kind == _HELLO:
-        return _unpack_hello(content)
-    if kind == _ACKNOWLEDGE:
-        return _unpack_acknowledge(content)
-    if kind == _COMPANION:
-        return _unpack_companion(content)
-    if kind == _COMMAND:
-        return _unpack_command(content)
-    return UnknownPacket(kind, content[_PREFIX.size :])
+    pack: Callable[[Any], bytes] | None = _PACK.get(type(packet))
+    if pack is None:
+        allowed = "a Scan, Hello, Acknowledge, CompanionReading, Command or UnknownPacket"
+        raise FieldError("packet", packet, allowed)
+    return pack(packet)
 
 
 def _pack_scan(scan: Scan) -> bytes:
@@ -388,6 +359,23 @@ def _pack_unknown(packet: UnknownPacket) -> bytes:
     if len(packet.body) > _MAX_BODY:
         raise FieldError("UnknownPacket.body", packet.body, f"at most {_MAX_BODY} bytes")
     return _PREFIX.pack(PROTOCOL_VERSION, kind) + packet.body
+
+
+_PACK: dict[type, Callable[[Any], bytes]] = {
+    Scan: _pack_scan,
+    Hello: _pack_hello,
+    Acknowledge: _pack_acknowledge,
+    CompanionReading: _pack_companion,
+    Command: _pack_command,
+    UnknownPacket: _pack_unknown,
+}
+_KNOWN_TYPES: dict[int, tuple[str, Callable[[bytes], Packet]]] = {
+    _SCAN: ("scan", _unpack_scan),
+    _HELLO: ("hello", _unpack_hello),
+    _ACKNOWLEDGE: ("acknowledge", _unpack_acknowledge),
+    _COMPANION: ("companion", _unpack_companion),
+    _COMMAND: ("command", _unpack_command),
+}
 
 
 def _format_of(samples: Samples) -> SampleFormat:

@@ -16,10 +16,7 @@ LABELS = {"up": "load rising", "down": "load falling", "unknown": "reading"}
 
 
 def draw_calibration(made: PressureCalibration, output: Path) -> None:
-    """Draw readings and curve, and where it says nothing.
-
-    Raises TactomoError where the picture cannot be written.
-    """
+    """Draw readings and curve; raise TactomoError where the picture cannot be written."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 5), layout="constrained")

@@ -24,12 +24,7 @@ CONNECT_S: Final = 1.0  # how long to wait where nobody listens: there need not 
 
 
 def reload_kept(name: str | None, address: str | None, keys: Path | None) -> str:
-    """Have the daemon of a sensor read its calibration again; returns in words what is in force.
-
-    Raises:
-        ClientError: it does not answer, refuses the calibration, or does not let us command.
-        SensorError: as `find_sensor` does.
-    """
+    """Have the daemon of a sensor read its calibration again; return in words what is in force."""
     there = find_commanded(name, address, keys)
     sensor, found = there.sensor, _reloaded(there.control, keys).calibration
     if found is None:
@@ -59,10 +54,7 @@ def keep(
 def taken_up(
     made: PressureCalibration | TaughtSkin, path: Path, address: str | None, keys: Path | None
 ) -> str:
-    """Have the daemon of its sensor, if it runs, go by what was kept in `path`.
-
-    Returns in words what became of it, and what is to be done.
-    """
+    """Have the sensor's daemon, if it runs, use what was kept; say in words what became of it."""
     from tactomo_client import CalibrationRefused, ClientError, KeysError, NoAnswer
     from tactomo_models.calibration.calibration_file import PressureCalibration, calibration_path
     from tactomo_models.calibration.taught_skin import taught_path

@@ -60,10 +60,7 @@ class RobotLog:
 
 
 def read_robot_log(path: Path) -> RobotLog:
-    """Read a robot's log.
-
-    Raises TactomoError where it cannot be read, or a line of it is wrong, which is named.
-    """
+    """Read a robot's log; raise TactomoError, which names the line that is wrong."""
     numbers = array("d")
     try:
         with open_regular(path) as binary, io.TextIOWrapper(binary, "utf-8", newline="") as file:

@@ -70,13 +70,7 @@ class _Process:
 
 
 class SkinProcesses:
-    """The processes of several skins; `run` them until a signal asks to end.
-
-    Args:
-        skins: their configurations.
-
-    Raises ModelError where a description or an artifact cannot be used.
-    """
+    """The processes of several skins. Raises ModelError where a description is unusable."""
 
     def __init__(self, skins: Sequence[DaemonConfig]) -> None:
         self._skins = skins
