@@ -250,7 +250,6 @@ def _merged(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _check_apart(path: Path, skins: Sequence[DaemonConfig]) -> None:
-    """Refuse skins that share a port, an address or a file."""
     owners: dict[str, str] = {}
     for skin in skins:
         for own in (*skin.ports, skin.stream, skin.control, skin.metrics, skin.recording.file):

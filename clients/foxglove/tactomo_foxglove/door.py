@@ -85,7 +85,6 @@ class Door:
     async def _relay(
         self, head: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
     ) -> None:
-        """Pass bytes on both ways until either side has ended."""
         answers, requests = await asyncio.open_connection(*self._behind)
         try:
             requests.write(head)

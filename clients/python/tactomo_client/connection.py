@@ -160,11 +160,7 @@ def connect_subscriber(
     latest_only: bool = False,
     keys: Keys | None = None,
 ) -> Connection:
-    """Connect a new SUB socket for these topics.
-
-    Raises:
-        ControlError: `address` is not an address; the socket is closed then.
-    """
+    """Connect a new SUB socket for these topics, or close it and raise ControlError."""
     connection = Connection(owner, address, keys)
     # A computer that lost power never closes its connections; heartbeats notice.
     connection.socket.setsockopt(zmq.HEARTBEAT_IVL, 1000)

@@ -94,7 +94,6 @@ class ControlLine:
         self._connection: Connection | None = None
 
     def _open(self) -> Owner:
-        """Return a new REQ socket."""
         raise NotImplementedError
 
     def _exchange(

@@ -64,8 +64,7 @@ class Received:
     def from_fields(cls, fields: Mapping[str, Any], received_ns: int, stale_after_s: float) -> Self:
         """Return the message of these fields that came at `received_ns` by the monotonic clock.
 
-        Raises:
-            MessageError: a field is missing or of the wrong type.
+        Raises MessageError where a field is missing or of the wrong type.
         """
         return filled(
             cls, fields, fields=fields, _received_ns=received_ns, _stale_after_s=stale_after_s

@@ -56,11 +56,11 @@ class Message(NamedTuple):
     fields: dict[str, Any]
 
 
-def check_sensor_name(name: str) -> str:
+def check_sensor_name(name: str, of: str = "sensor") -> str:
     """Return `name` if it may stand in a topic; raise MessageError saying what is allowed."""
     if not isinstance(name, str) or not _SENSOR_NAME.fullmatch(name):
         raise MessageError(
-            f"{name!r} is not a sensor name",
+            f"{name!r} is not a {of} name",
             "use 1 to 64 letters, digits, '_', '-' or '.', starting with a letter or digit",
         )
     return name
@@ -77,17 +77,11 @@ def topic(sensor: str, kind: str) -> bytes:
 
 
 def encode_message(sensor: str, kind: str, fields: Mapping[str, Any]) -> bytes:
-    """Return the bytes of one stream message.
+    """Return the bytes of one stream message; raise MessageError where a value has no wire form.
 
-    Args:
-        sensor: the sensor's name.
-        kind: one of KINDS.
-        fields: the header (STREAM.md, "Envelope") without `schema`, `sensor` and `kind`, which are
-            filled in here, and the kind's own fields. NumPy arrays and scalars may stand anywhere
-            in it; NaN is allowed in arrays, while a single unknown value is None.
-
-    Raises:
-        MessageError: a header field is missing or of the wrong type, or a value has no wire form.
+    `fields` are the header (STREAM.md, "Envelope") without `schema`, `sensor` and `kind`, and the
+    kind's own. NumPy arrays and scalars may stand anywhere; NaN is allowed in arrays, while an
+    unknown value is None.
     """
     head = topic(sensor, kind)
     _check_header(fields)
@@ -243,15 +237,10 @@ _IMAGES = dict.fromkeys(set(wire_fields(Frame)) - set(wire_fields(Contacts)))
 
 
 def frame_from_message(message: Message, received_ns: int | None, stale_after_s: float) -> Frame:
-    """Return the frame in a `map` or `contacts` message.
+    """Return the frame in a `map` or `contacts` message, which is stale from `stale_after_s` on.
 
-    Args:
-        message: the message.
-        received_ns: when it came, by the monotonic clock; None for one that was recorded.
-        stale_after_s: the age in seconds from which the frame is stale.
-
-    Raises:
-        MessageError: a field is missing or of the wrong type.
+    `received_ns` is when the message came, by the monotonic clock; None for a recorded one. Raises
+    MessageError where a field is missing or of the wrong type.
     """
     fields = message.fields
     has_images = message.kind == MAP

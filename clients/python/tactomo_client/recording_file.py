@@ -287,7 +287,6 @@ def _intact(start: int, chunk: Chunk) -> IntactChunk:
 
 
 def _index_bytes(messages: list[Message]) -> int:
-    """Return the length of a chunk's message indexes."""
     return 15 * len({message.channel_id for message in messages}) + 16 * len(messages)
 
 

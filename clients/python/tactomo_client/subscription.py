@@ -98,7 +98,6 @@ class Reception(Generic[T_co]):
         )
 
     def _open(self) -> Owner:
-        """Return a new SUB socket."""
         raise NotImplementedError
 
     @property

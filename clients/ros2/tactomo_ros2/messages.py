@@ -188,7 +188,6 @@ def _sigma_kpa(frame: Frame, points: NDArray[np.void]) -> NDArray[np.float64]:
 
 
 def _contact_points(frame: Frame) -> NDArray[np.void]:
-    """Return a point for each contact, with all that is known of it."""
     points = np.zeros(len(frame.contacts), CONTACT_POINT)
     for point, contact in zip(points, frame.contacts, strict=True):
         cells = table_row(contact)

@@ -23,9 +23,7 @@ class Heard(NamedTuple):
 class Feed:
     """Reads one sensor's stream. `on_change` is called after each message that was taken in.
 
-    Raises:
-        MessageError: `sensor` cannot be a sensor's name.
-        ControlError: `address` is not an address.
+    Raises MessageError where `sensor` cannot be a name, ControlError where `address` is none.
     """
 
     def __init__(

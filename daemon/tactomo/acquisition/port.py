@@ -183,7 +183,6 @@ class PortReader(Worker):
         self._send(self.protocol.stop())
 
     def _read_once(self) -> None:
-        """Wait for bytes, for a bounded time, and pass on what they hold."""
         source = self.connection
         data = source.read()
         # The clocks are read here, before anything else is done with the bytes.
@@ -213,7 +212,6 @@ class PortReader(Worker):
         self._ask()
 
     def _attend(self, now_s: float) -> None:
-        """See to a device that does not do as it should."""
         if now_s - self._asked_s > self._ask_after_s:
             self._ask()
         if self._is_zeroing.is_set():
@@ -342,7 +340,6 @@ class PortReader(Worker):
             )
 
     def _note_fault(self, fault: str, now_s: float) -> None:
-        """Take note of, and tell, what a device's firmware does against its protocol."""
         self._fault, self._fault_s = fault, now_s
         self._tell(
             "firmware_fault",
@@ -351,7 +348,6 @@ class PortReader(Worker):
         )
 
     def _tell(self, name: str, words: str = "", next_step: str = "", reason: str = "") -> None:
-        """Tell something of this port."""
         detail = f"{self.url}: {words}" if words else self.url
         self._on_event(name, detail, next_step, self.url, reason)
 
@@ -420,7 +416,6 @@ class PortReader(Worker):
         return self.is_open or self.hello is None or self.hello.device_id != device_id
 
     def _ask(self) -> None:
-        """Ask the device who it is and to start."""
         self._asked_s = time.monotonic()
         self._send(self.protocol.introduction())
 
@@ -450,11 +445,9 @@ class PortReader(Worker):
 
     @property
     def _has_fault(self) -> bool:
-        """Whether the firmware has just now done something against its protocol."""
         return bool(self._fault) and time.monotonic() - self._fault_s < FAULT_LASTS_S
 
     def _tell_unanswered(self, now_s: float) -> None:
-        """Tell that a device that speaks acknowledges nothing."""
         since_s, speaks = self._unanswered_s, (DeviceState.RUNNING, DeviceState.IDLE)
         is_due = since_s is not None and now_s - since_s > UNANSWERED_S
         if is_due and self._liveness.state in speaks:
@@ -466,7 +459,6 @@ class PortReader(Worker):
             )
 
     def _tell_trouble(self, state: DeviceState) -> None:
-        """Tell in what trouble a device is, and when it is out of it again."""
         trouble = self._trouble(state)
         if state is not self._judged:  # looked for now and then: through all processes
             sharers = "; ".join(map(str, other_holders(self.url))) if trouble else ""

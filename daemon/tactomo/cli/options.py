@@ -61,7 +61,6 @@ def description_names() -> list[str]:
 
 
 def _known_method(context: typer.Context, name: str | None) -> str | None:
-    """Refuse as wrong usage what is no method."""
     if name is None or context.resilient_parsing:
         return name
     from tactomo_models.errors import MethodError

@@ -80,8 +80,10 @@ def newest_status(
 
 def name_of(name: str | None) -> str:
     """Return the name of the sensor that is meant, be it running or not."""
+    from tactomo_client.messages import check_sensor_name
+
     if name is not None:
-        return name
+        return check_sensor_name(name)
     return find_sensor(None, None).sensor if running("daemon") else DEFAULT_NAME
 
 
@@ -132,7 +134,6 @@ def _heard_of(name: str | None, address: str, keys: Path | None) -> Running:
 
 
 def _status_of(name: str | None, address: str, keys: Path | None) -> Mapping[str, Any]:
-    """Return the status of the only sensor that a stream carries, or of the named one."""
     statuses = _statuses(name, address, keys)
     if not statuses:
         raise SensorError(

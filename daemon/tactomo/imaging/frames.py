@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 from tactomo_client.messages import array_to_wire
+from tactomo_client.schema import Device, wire_fields
 from tactomo_models import Contact, Flag, Reconstruction, SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.calibration.calibration_file import PressureCalibration
@@ -210,14 +211,7 @@ def port_fields(port: PortReader) -> dict[str, Any]:
 
 def device_fields(hello: Hello) -> dict[str, Any]:
     """Return what `status` says about a device."""
-    return {
-        "device_id": hello.device_id,
-        "firmware": hello.firmware,
-        "channels": list(hello.channels),
-        "electrodes": hello.electrodes,
-        "samples_per_scan": hello.samples_per_scan,
-        "scan_rate_hz": hello.scan_rate_hz,
-    }
+    return {name: getattr(hello, name) for name in wire_fields(Device)}
 
 
 def magnitude_max(description: SensorDescription) -> float | None:

@@ -114,7 +114,6 @@ def _registered(name: str) -> type[PortProtocol]:
 
 
 def _load(path: str) -> Any:
-    """Return the attribute that `my_module:MyProtocol` names."""
     module_name, _, attribute = path.partition(":")
     if not all(part.isidentifier() for part in (*module_name.split("."), attribute)):
         raise ConfigError(f"{path!r} names no class", "give it as my_module:MyProtocol")

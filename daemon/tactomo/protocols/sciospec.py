@@ -235,7 +235,6 @@ class Sciospec(ForeignProtocol):
         self._is_skipping = True
 
     def _take(self, found: bytes) -> Reading | None:
-        """Take note of a data message; return the frame that it completes."""
         place = self._sinks.get((found[3], found[4]))
         if place is None:
             self._note_stranger(found)
@@ -319,7 +318,6 @@ class Sciospec(ForeignProtocol):
             self.clock_format = Clock.NONE
 
     def _note_stranger(self, found: bytes) -> None:
-        """Say so where all that comes is of another pattern."""
         self._strangers += 1
         if self._strangers > 8 * CHANNELS * self._groups and self.trouble is None:
             self.trouble = Trouble(

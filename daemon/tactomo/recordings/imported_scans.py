@@ -197,7 +197,6 @@ def _of_channel(
     pattern: NamedPattern | None,
     turn_rad: float | None,
 ) -> Scans:
-    """The scans of a file of one channel; see `read_scans`."""
     rest: NDArray[Any] | None = None
     if array is None and is_single_ended(arrays):
         raw, time_s = _differences(path, arrays, description)

@@ -39,7 +39,6 @@ class Playback:
 
     @property
     def _stands(self) -> bool:
-        """Whether nothing is due."""
         return self._is_paused and not self._is_stepping
 
     @property
@@ -139,7 +138,6 @@ class Playback:
             self._position_ns, self._since_ns = clock_ns, time.monotonic_ns()
 
     def _settle(self) -> None:
-        """Count from here and now."""
         self._position_ns = self.position_ns
         self._since_ns = None if self._since_ns is None else time.monotonic_ns()
 

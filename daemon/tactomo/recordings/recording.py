@@ -16,7 +16,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import IO, Annotated, Any, Final, NamedTuple
@@ -67,11 +67,12 @@ class Chunk(NamedTuple):
 class Origin:
     """What a recording is of."""
 
-    sensor: str
-    description: str  # the shipped description's name, or its path on the computer that recorded
-    description_sha256: str
-    ports: tuple[str, ...]
-    version: str
+    sensor: str = ""
+    # the shipped description's name, or its path on the computer that recorded
+    description: str = ""
+    description_sha256: str = ""
+    ports: tuple[str, ...] = ("",)
+    version: str = ""
     protocol: str = NATIVE  # what the ports speak
     calibration: str = ""
     """The pressure calibration that the daemon began it with, as the text of its file; empty for
@@ -289,7 +290,6 @@ def _summarise(path: Path, origin: Origin) -> Summary:
 
 
 def _has_chunks(path: Path, start: int) -> bool:
-    """Whether an intact chunk begins at or after a position in the file."""
     with open_file(path) as file:
         return any(True for _ in intact_chunks(file, start))
 
@@ -310,17 +310,8 @@ def _count_packets(summary: Summary, decoder: PortProtocol, data: bytes) -> None
 
 def to_origin(metadata: Mapping[str, str]) -> Origin:
     """Return what a recording's metadata record says that it is of."""
-    ports = tuple(metadata.get("ports", "").split("\n"))
-    return Origin(
-        sensor=metadata.get("sensor", ""),
-        description=metadata.get("description", ""),
-        description_sha256=metadata.get("description_sha256", ""),
-        ports=ports,
-        version=metadata.get("version", ""),
-        protocol=metadata.get("protocol", NATIVE),
-        calibration=metadata.get("calibration", ""),
-        description_text=metadata.get("description_text", ""),
-    )
+    told: dict[str, Any] = {f.name: metadata[f.name] for f in fields(Origin) if f.name in metadata}
+    return Origin(**told | {"ports": tuple(metadata.get("ports", "").split("\n"))})
 
 
 def _messages(path: Path, from_ns: int = 0) -> Iterator[tuple[str, Message]]:
@@ -373,7 +364,6 @@ def _read_reference(data: bytes) -> Reference:
 
 
 def _at_rest(readings: Any) -> tuple[tuple[str, float], ...] | None:
-    """Return a reference's readings of companions; None where there are none."""
     if readings is None:
         return None
     if not isinstance(readings, dict) or not all(

@@ -11,6 +11,7 @@ import os
 import shlex
 import time
 from collections.abc import Iterable
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -167,16 +168,7 @@ class RecordingWriter:
 
     def _begin(self, origin: Origin) -> None:
         self._writer.start(profile=PROFILE, library=f"tactomo {origin.version}")
-        metadata = {
-            "sensor": origin.sensor,
-            "description": origin.description,
-            "description_sha256": origin.description_sha256,
-            "ports": "\n".join(origin.ports),
-            "version": origin.version,
-            "protocol": origin.protocol,
-            "calibration": origin.calibration,
-            "description_text": origin.description_text,
-        }
+        metadata = {**asdict(origin), "ports": "\n".join(origin.ports)}
         self._writer.add_metadata(PROFILE, metadata)
         # Always the same ones in the same order: should the chunk that names them be lost, what
         # the others hold is known by number.

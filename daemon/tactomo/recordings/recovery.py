@@ -285,4 +285,4 @@ def _guess_origin(file: IO[bytes]) -> Origin:
         if has_second:
             break
     ports = ("unknown", "unknown") if has_second else ("unknown",)
-    return Origin("", "", "", ports, version("tactomo"))
+    return Origin(ports=ports, version=version("tactomo"))

@@ -171,7 +171,6 @@ class _Made:
 
 
 def _about_the_daemon(made: _Made, status: Mapping[str, Any]) -> None:
-    """Turn the fields of `status` into metrics."""
     rates, reference, recording = status["rates"], status["reference"], status["recording"]
     build = {"version": status["version"], "model": status["description"]["model"]}
     age_ns = status["age_ns"]

@@ -9,7 +9,6 @@ nothing but `make_pair` ever sees a secret key.
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import tempfile
 from dataclasses import dataclass
@@ -20,12 +19,11 @@ import zmq
 from platformdirs import user_config_path
 from tactomo_client.errors import KeysError
 from tactomo_client.keys import PUBLIC_SUFFIX, SECRET_SUFFIX, read_public
+from tactomo_client.messages import check_sensor_name
 
 CLIENTS_SUFFIX: Final = ".clients"
 MAY_COMMAND: Final = "may_command"
 SYSTEM_FOLDER: Final = Path("/etc/tactomo/keys")
-
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 
 @dataclass(frozen=True)
@@ -44,17 +42,17 @@ def default_folder() -> Path:
 
 def secret_path(folder: Path, name: str) -> Path:
     """Return where the secret key of this name lies."""
-    return folder / f"{_checked(name)}{SECRET_SUFFIX}"
+    return folder / f"{check_sensor_name(name, 'key')}{SECRET_SUFFIX}"
 
 
 def public_path(folder: Path, name: str) -> Path:
     """Return where the public key of this name lies."""
-    return folder / f"{_checked(name)}{PUBLIC_SUFFIX}"
+    return folder / f"{check_sensor_name(name, 'key')}{PUBLIC_SUFFIX}"
 
 
 def clients_folder(folder: Path, server: str) -> Path:
     """Return where the clients of this server are listed."""
-    return folder / f"{_checked(server)}{CLIENTS_SUFFIX}"
+    return folder / f"{check_sensor_name(server, 'key')}{CLIENTS_SUFFIX}"
 
 
 def how_to_allow(clients: Path, *, may_command: bool = False) -> str:
@@ -190,21 +188,18 @@ def _clients(folder: Path, may_command: bool) -> list[Client]:
 
 
 def _places(folder: Path, server: str, name: str) -> tuple[Path, Path]:
-    listed, file = clients_folder(folder, server), f"{_checked(name)}{PUBLIC_SUFFIX}"
+    listed, file = (
+        clients_folder(folder, server),
+        f"{check_sensor_name(name, 'key')}{PUBLIC_SUFFIX}",
+    )
     return listed / file, listed / MAY_COMMAND / file
 
 
 def _checked(name: str) -> str:
-    if not _NAME.fullmatch(name):
-        raise KeysError(
-            f"{name!r} cannot be the name of a key",
-            "use 1 to 64 letters, digits, '_', '-' or '.', starting with a letter or digit",
-        )
-    return name
+    return check_sensor_name(name, "key")
 
 
 def _text(public: str, secret: str | None = None) -> str:
-    """Return a certificate's content."""
     lines = ["metadata", "curve", f'    public-key = "{public}"']
     if secret is not None:
         lines = ["# Secret: for its owner's eyes only.", *lines, f'    secret-key = "{secret}"']

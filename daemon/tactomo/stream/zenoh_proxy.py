@@ -105,7 +105,6 @@ class ZenohProxy(Relay):
                 self._outlet.send(message, zmq.DONTWAIT)
 
     def _note(self, message: bytes) -> None:
-        """Keep the last status of each sensor."""
         topic, _, _ = message[:MAX_TOPIC_BYTES].partition(b"\0")
         is_known = len(self._statuses) < MAX_SENSORS or topic + b"\0" in self._statuses
         if topic.endswith(f"/{STATUS}".encode()) and is_known:

@@ -15,8 +15,6 @@ from tactomo.twin.foreign import Frame, Grounded
 
 
 class _Printer:
-    """What both have in common."""
-
     largest: float
 
     def __init__(self, description: SensorDescription, rate_hz: float) -> None:
@@ -37,7 +35,6 @@ class _Printer:
         return lines
 
     def _read(self, volts: FloatArray) -> FloatArray:
-        """What the board makes of voltages."""
         if not self._gain:
             self._gain = self.largest / float(np.abs(volts).max())
         read = volts * self._gain

@@ -422,7 +422,6 @@ class Twin:
 
 
 def _wiring(config: TwinConfig) -> dict[str, tuple[Channel, ...]]:
-    """Return the channels that each line carries, by the line's name."""
     channels = config.description.channels
     return {"skin": channels} if config.ports == 1 else {c: (c,) for c in channels}
 

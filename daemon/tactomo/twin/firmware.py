@@ -176,7 +176,6 @@ class Firmware:
         )
 
     def _obey(self, port: Port, command: Command) -> None:
-        """Carry out one command and acknowledge it on the line that it came from."""
         status = AckStatus.OK
         if command.code == CommandCode.START:
             if not self._is_streaming:

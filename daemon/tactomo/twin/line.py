@@ -138,7 +138,6 @@ class SerialLine:
             raise
 
     def _write(self, data: bytes) -> bytes:
-        """Write what fits and return the rest."""
         if not data or self._descriptor is None:
             return b""
         try:

@@ -116,15 +116,12 @@ class ScriptedPress(Indenter):
             return None
         age_s = scene_s - self.at_s
         times, x_mm, y_mm, pressure_kpa = self._track()
-        return Indenter(
-            x_mm=float(np.interp(age_s, times, x_mm)),
-            y_mm=float(np.interp(age_s, times, y_mm)),
-            radius_mm=self.radius_mm,
-            radius_y_mm=self.radius_y_mm,
-            angle_deg=self.angle_deg,
-            pressure_kpa=float(np.interp(age_s, times, pressure_kpa)) * self._ramp(age_s),
-            shape=self.shape,
-        )
+        now = {
+            "x_mm": float(np.interp(age_s, times, x_mm)),
+            "y_mm": float(np.interp(age_s, times, y_mm)),
+            "pressure_kpa": float(np.interp(age_s, times, pressure_kpa)) * self._ramp(age_s),
+        }
+        return Indenter(**self.model_dump(include=set(Indenter.model_fields)) | now)
 
     def _track(self) -> tuple[list[float], list[float], list[float], list[float]]:
         times, x_mm, y_mm, pressure_kpa = [0.0], [self.x_mm], [self.y_mm], [self.pressure_kpa]

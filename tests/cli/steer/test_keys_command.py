@@ -103,7 +103,7 @@ def test_a_client_is_listed_once_and_taken_off(keys: Run, tactomo: Run, tmp_path
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("make", "../left"), "cannot be the name of a key"),
+        (("make", "../left"), "'../left' is not a key name"),
         (("allow", "none.key", "--for", "left"), "No such file"),
         (("allow", "empty.key", "--for", "left"), "cannot read a key"),
         (("allow", "desk.key_secret", "--for", "left"), "must not leave its computer"),

@@ -157,7 +157,6 @@ def bench(
 
 
 def _chart(results: Results, picture: Path, count: int, methods: list[str], as_json: bool) -> None:
-    """Measure and draw speed against accuracy, and print the table."""
     results.chart, fronts = measurement("chart")(
         results.description, picture, count, results.machine, methods
     )
@@ -168,7 +167,6 @@ def _chart(results: Results, picture: Path, count: int, methods: list[str], as_j
 
 
 def _machine_speed(results: Results, as_json: bool) -> None:
-    """Measure what a time buys on this machine."""
     from tactomo.cli.bench import machine_speed as bench_machine_speed
 
     made = bench_machine_speed.measure(results.description)
@@ -186,7 +184,6 @@ def _machine_speed(results: Results, as_json: bool) -> None:
 def _measure_twin(
     results: Results, ports: int | None, rate: float, seconds: float, report: Callable[[str], None]
 ) -> None:
-    """Press a twin in several ways and measure each."""
     from tactomo_client import request, subscribe
     from tactomo_models import load_description
 
@@ -244,7 +241,6 @@ def _measure(
     control: str,
     moves: Callable[[float], None] | None,  # gets the share of the time that has passed
 ) -> Phase:
-    """Measure what comes within a time."""
     import numpy as np
     from tactomo_client import request
 

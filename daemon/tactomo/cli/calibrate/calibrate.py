@@ -79,13 +79,15 @@ def live(
     continues later.
     """
     from tactomo_client.control import to_status
+    from tactomo_models.calibration.calibration_file import calibration_path
 
     from tactomo.cli.calibrate.live import guided
     from tactomo.cli.calibrate.reload import keep
 
     found = find_sensor(sensor, address, keys)
     status = to_status(newest_status(found.sensor, address, keys))
-    path, area = _path(found.sensor, output), _area_mm2(diameter_mm, area_mm2)
+    path = output or calibration_path(found.sensor)
+    area = _area_mm2(diameter_mm, area_mm2)
     made = guided(status, found.stream, keys, area, path, fresh=fresh)
     print_calibration(made)
     keep(made, path, address, keys)
@@ -137,11 +139,13 @@ def fit(
     if not math.isfinite(time_offset):
         raise typer.BadParameter(f"--time-offset {time_offset}: give seconds")
     area = _area_mm2(diameter_mm, area_mm2)
+    from tactomo_models.calibration.calibration_file import calibration_path
+
     from tactomo.cli.calibrate.fit import fitted
     from tactomo.cli.calibrate.reload import keep
 
     name = name_of(sensor)
-    path = _path(name, output)
+    path = output or calibration_path(name)
     made, odd = fitted(
         name, readings, recording, area, time_offset, description, tuple(device_id or ())
     )
@@ -176,10 +180,10 @@ def show(
 ) -> None:
     """Show a sensor's calibration: curve, uncertainty and readings."""
     from tactomo_models import CalibrationError
-    from tactomo_models.calibration.calibration_file import read_calibration
+    from tactomo_models.calibration.calibration_file import calibration_path, read_calibration
 
     name = name_of(sensor)
-    path = _path(name, file)
+    path = file or calibration_path(name)
     try:
         made = read_calibration(path)
     except FileNotFoundError as error:
@@ -200,14 +204,6 @@ def reload(
     from tactomo.cli.calibrate.reload import reload_kept
 
     say(reload_kept(sensor, address, keys))
-
-
-def _path(sensor: str, given: Path | None) -> Path:
-    from tactomo_client.messages import check_sensor_name
-    from tactomo_models.calibration.calibration_file import calibration_path
-
-    check_sensor_name(sensor)
-    return given or calibration_path(sensor)
 
 
 def _area_mm2(diameter_mm: float | None, area_mm2: float | None) -> float | None:

@@ -52,7 +52,6 @@ def fitted(
 
 
 def _odd_lines(joined: load_cell.Joined) -> list[str]:
-    """Name the lines that the others contradict."""
     odd = [(joined.lines[i], joined.readings[i]) for i in find_outliers(joined.readings)]
     return [
         f"line {line} ({reading.pressure_kpa:.0f} kPa, |Δσ|/σ₀ {reading.magnitude:.3f})"

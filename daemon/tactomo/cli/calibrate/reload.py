@@ -91,7 +91,6 @@ def taken_up(
 
 
 def _reloaded(control: str, keys: Path | None) -> CalibrationInForce:
-    """Ask a sensor's daemon to read what is kept again; returns what is in force."""
     from tactomo_client import Daemon
 
     with Daemon(control, keys=keys, connect_timeout_s=CONNECT_S) as daemon:

@@ -68,10 +68,12 @@ def live(
     The command says where to press, listens for a second while you hold the press, and learns at
     the end. Each press is stored at once; the same command continues later.
     """
+    from tactomo_models.calibration.taught_skin import taught_path
+
     from tactomo.cli.calibrate.teach_live import guided
 
     found = find_sensor(sensor, address, keys)
-    path = _path(found.sensor, output)
+    path = output or taught_path(found.sensor)
     file = presses or path.with_name(f"{found.sensor}.presses.npz")
     sensor_description, subject = guided(found.sensor, found.stream, keys, description, file)
     _teach(file, sensor_description, subject, path, address, keys, keep_odd=keep_odd)
@@ -107,10 +109,11 @@ def fit(
     """
     from tactomo_models import load_description
     from tactomo_models.calibration.calibration_file import Subject
+    from tactomo_models.calibration.taught_skin import taught_path
 
     known, name = load_description(description), name_of(sensor)
     subject = Subject.of(name, known, device_id or ())
-    path = None if dry_run else _path(name, output)
+    path = None if dry_run else output or taught_path(name)
     _teach(presses, known, subject, path, address, keys, keep_odd=keep_odd)
 
 
@@ -124,24 +127,16 @@ def show(
 ) -> None:
     """Show a skin's taught model: its presses and its errors."""
     from tactomo_models import CalibrationError
-    from tactomo_models.calibration.taught_skin import read_taught
+    from tactomo_models.calibration.taught_skin import read_taught, taught_path
 
     name = name_of(sensor)
-    path = _path(name, file)
+    path = file or taught_path(name)
     try:
         _print(read_taught(path))
     except FileNotFoundError as error:
         raise CalibrationError(
             f"nothing was taught in {path}; run: tactomo teach live --sensor {name}"
         ) from error
-
-
-def _path(sensor: str, given: Path | None) -> Path:
-    from tactomo_client.messages import check_sensor_name
-    from tactomo_models.calibration.taught_skin import taught_path
-
-    check_sensor_name(sensor)
-    return given or taught_path(sensor)
 
 
 def _teach(

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,9 @@ from tactomo.recordings.imported_scans import (
     read_scans,
 )
 from tactomo.recordings.recording import Recording
+
+if TYPE_CHECKING:
+    from tactomo_client.connection import Connection
 
 CHANGES = "dv"
 ANY_RING = "tank_disc"  # stands for a sheet that nobody has described, while its file is read
@@ -88,19 +91,23 @@ def of_daemon(
     progress: Callable[[float], None],
 ) -> Evidence:
     """Listen to a running daemon; raise DoctorError where no daemon answers, or it has no scans."""
-    from tactomo_client.messages import MAP, SCAN, STATUS
+    import zmq
+    from tactomo_client.connection import connect_subscriber
+    from tactomo_client.messages import MAP, SCAN, STATUS, topic
 
-    listener = _Listener(sensor, stream, keys)
+    said: dict[str, list[dict[str, Any]]] = {MAP: [], SCAN: [], STATUS: []}
+    socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
+    connection = connect_subscriber(socket, stream, [topic(sensor, k) for k in said], keys=keys)
     try:
-        before = listener.first_status()
+        before = _first_status(connection, f"{stream} for a sensor {sensor!r}")
         begin_s = time.monotonic()
         while (passed_s := time.monotonic() - begin_s) < seconds:
             progress(passed_s)
-            listener.listen(min(0.2, seconds - passed_s))
-        said = listener.said
+            for message in connection.heard(min(0.2, seconds - passed_s)):
+                said[message.kind].append(message.fields)
     finally:
-        listener.close()
-    after = said[STATUS][-1]
+        connection.close()
+    after = (said[STATUS] or [before])[-1]
     if not said[SCAN]:
         raise DoctorError(
             f"the daemon of {sensor} is {after['state']} and has no scans to examine",
@@ -120,42 +127,14 @@ def of_daemon(
     return evidence
 
 
-class _Listener:
-    """Keeps what one sensor's daemon says."""
-
-    def __init__(self, sensor: str, stream: str, keys: Keys | None) -> None:
-        import zmq
-        from tactomo_client.connection import connect_subscriber
-        from tactomo_client.messages import MAP, SCAN, STATUS, topic
-
-        self.said: dict[str, list[dict[str, Any]]] = {MAP: [], SCAN: [], STATUS: []}
-        self._where = f"{stream} for a sensor {sensor!r}"
-        topics = [topic(sensor, kind) for kind in self.said]
-        socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
-        self._connection = connect_subscriber(socket, stream, topics, keys=keys)
-
-    def first_status(self) -> dict[str, Any]:
-        """Wait for a status and forget what came before it; DoctorError where there is none."""
-        end_s = time.monotonic() + STALE_AFTER_S
-        while not self.said["status"] and (left_s := end_s - time.monotonic()) > 0:
-            self.listen(left_s)
-        if not self.said["status"]:
-            raise DoctorError(
-                f"no daemon answers at {self._where}",
-                "`tactomo status` shows its state",
-            )
-        status = self.said["status"][-1]
-        self.said = {kind: [] for kind in self.said} | {"status": [status]}
-        return status
-
-    def listen(self, wait_s: float) -> None:
-        """Take in what comes, waiting for it at most `wait_s`."""
-        for message in self._connection.heard(wait_s):
-            self.said[message.kind].append(message.fields)
-
-    def close(self) -> None:
-        """Close the subscription."""
-        self._connection.close()
+def _first_status(connection: Connection, where: str) -> dict[str, Any]:
+    """Wait for a status; what came before it is forgotten."""
+    end_s = time.monotonic() + STALE_AFTER_S
+    while (left_s := end_s - time.monotonic()) > 0:
+        for message in connection.heard(left_s):
+            if message.kind == "status":
+                return message.fields
+    raise DoctorError(f"no daemon answers at {where}", "`tactomo status` shows its state")
 
 
 def _layout_of_status(
@@ -280,8 +259,6 @@ def of_recording(recording: Recording, description: str | None, frames: slice | 
 
 
 class _Taken(NamedTuple):
-    """A scan in a recording."""
-
     channel: Channel
     counter: int
     device_us: int
@@ -375,7 +352,6 @@ def _cut(path: Path, scans: FloatArray, frames: slice) -> FloatArray:
 
 
 def _at_rest(path: Path, arrays: Mapping[str, NDArray[Any]]) -> str:
-    """Name the array of scans of the unpressed sheet."""
     name = next((known for known in (*AT_REST, NUMBERS) if known in arrays), None)
     if name is not None:
         return name

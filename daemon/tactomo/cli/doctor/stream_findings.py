@@ -119,7 +119,6 @@ def _pressed_found(evidence: Evidence) -> Finding:
 
 
 def _issues_found(evidence: Evidence) -> list[Finding]:
-    """What the daemon itself finds wrong."""
     levels = {"error": Level.FAULT, "warning": Level.ADVICE}
     return [
         Finding("daemon", levels[issue["severity"]], issue["what"], issue["next_step"])

@@ -206,7 +206,6 @@ def _dataset_writer(
 
 
 def _prepare_folder(output: Path) -> None:
-    """Make sure that a folder can be written that is not there yet."""
     if output.suffix.lower() in KINDS:
         raise typer.BadParameter(f"{output}: that is a folder; name {output.with_suffix('')}")
     if output.exists():
@@ -224,7 +223,6 @@ def _checked(count: int) -> int:
 
 
 def _write_file(output: Path, write: Callable[[IO[bytes]], int]) -> int:
-    """Write a file as a whole."""
     from tactomo_models.archive import write_whole
 
     count = 0

@@ -205,7 +205,6 @@ def _clock(log: RobotLog | None, gaps: Gaps) -> Callable[[Moment], float]:
 def _values(
     sensor: str, touch: Touch, step: Step, log: RobotLog | None, row: int
 ) -> dict[str, Any]:
-    """Return a row of the dataset."""
     arrays = touch.arrays(step.moment and step.moment.frame)
     arrays["age_s"] = np.array([step.age_s], np.float32)
     values = {f"observation.tactile.{sensor}.{name}": array for name, array in arrays.items()}
@@ -219,7 +218,6 @@ def _values(
 
 
 def _features(values: Mapping[str, Any], log: RobotLog | None) -> dict[str, Any]:
-    """Return what LeRobot is told of each of these values."""
     from tactomo_client.touch import CONTACT_COLUMNS
 
     names: dict[str, Any] = {}

@@ -82,22 +82,14 @@ def reconstruct(
     of IN, or the mean of the file `--reference`. `--pattern 32:adjacent`, `16:opposite:adjacent` or
     `16:adjacent:rotated` replaces the description's electrodes and pattern.
 
-    OUT holds, for T frames: `map` (T, ny, nx), the relative conductivity change; `pressure_kpa` (T,
-    ny, nx), NaN where unknown; `structure` (T, ny, nx), 0 bare to 1 pressed (-1 for objects that
-    conduct worse, where objects conduct `either_way`); `misfit`, `confidence`, `force_n`,
-    `force_sigma_n`, `flags` and `seconds` (T,). The contacts of all frames are flat arrays:
-    `contact_frame`, `contact_x_mm`, `contact_y_mm`, `contact_area_mm2`, `contact_magnitude`,
-    `contact_pressure_kpa`, `contact_force_n`, their standard uncertainties (`contact_sigma` is the
-    magnitude's), `contact_pressure_range` (*within*, *below*, *above* or *unknown*), the highest
-    pressure `contact_peak_kpa` with its upper bound `contact_max_kpa` (95 %), the profile exponent
-    `contact_edge` (0 flat, 0.5 Hertz), and `contact_taught`. docs/files.md explains each array.
+    OUT holds, for T frames: `map` (relative conductivity change), `pressure_kpa` and `structure` (0
+    bare to 1 pressed), each (T, ny, nx) with NaN where unknown; `misfit` (about 1 is good),
+    `confidence`, `force_n`, `flags` and `seconds` (T,); and the contacts of all frames as flat
+    arrays: `contact_frame`, `contact_x_mm`, `contact_pressure_kpa` and so on. docs/files.md
+    explains each array.
 
     Frames form a sequence, as in a stream: each solve starts from the result of the frame before.
     Put unrelated scenes into files of their own.
-
-    `misfit` is the rms of the residual in units of the scans' noise: about 1 is good, and a frame
-    above 2 is flagged (above 1.5 over both channels, where a network with low confidence made the
-    map).
 
     `flags` is the sum of the reasons to distrust a frame: 1 structure missing, 2 magnitude missing,
     4 invalid voltage, 8 no reference, 16 misfit high, 32 not converged, 64 reference mismatch, 128

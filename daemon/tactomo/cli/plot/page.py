@@ -197,7 +197,6 @@ def _draw_rows(
     maps: Sequence[Moment],
     colours: dict[str, Any],
 ) -> None:
-    """Draw what is over time, one above the other, with the maps' letters on top."""
     heights = [HEIGHTS_IN[row] for row in rows]
     column = figure.subplots(len(rows), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
     for row, axes in zip(rows, column, strict=True):
@@ -222,7 +221,6 @@ def _draw_rows(
 
 
 def _draw_pressure(axes: Any, course: Course, colours: dict[str, Any]) -> None:
-    """Draw how hard is pressed, by what is known of it."""
     contacts = [contact for track in course.tracks.values() for contact in track.contacts]
     if any(c.pressure_kpa is not None or c.pressure_range == "below" for c in contacts):
         _draw_quantity(axes, course, colours, "pressure_kpa", "pressure_sigma_kpa")

@@ -224,7 +224,6 @@ def _run_daemon(
     begin_replay: Callable[[Playback], None] = lambda _: None,
     description: SensorDescription | None = None,
 ) -> int:
-    """Serve until the daemon is stopped, and return its exit status."""
     _prepare(settings)
     from tactomo.service.daemon import Daemon
 
@@ -235,7 +234,6 @@ def _run_daemon(
 
 
 def _run_skins(skins: tuple[DaemonConfig, ...]) -> int:
-    """Serve several skins until stopped, and return the exit status."""
     _prepare(skins[0])
     from tactomo.cli.run.skins import SkinProcesses
 
@@ -251,7 +249,6 @@ def _prepare(settings: DaemonConfig) -> None:
 
 
 def _speed(text: str) -> float:
-    """Return the factor; 0 for "max"."""
     try:
         factor = 0.0 if text == "max" else float(text)
     except ValueError:

@@ -42,8 +42,6 @@ log = structlog.get_logger()
 
 
 class _Process:
-    """One child: a skin's daemon."""
-
     def __init__(self, name: str, run: Callable[[], int], ear: socket.socket) -> None:
         self.name = name
         self.run = run
@@ -189,7 +187,6 @@ class SkinProcesses:
 
 
 def _stop(processes: list[_Process]) -> None:
-    """Have every process stop, and wait for that; kill the one that does not."""
     running = [process for process in processes if process.pid]
     for process in running:
         os.kill(process.pid, signal.SIGTERM)

@@ -58,11 +58,13 @@ def install(
     skins one by one, each with addresses of its own, or write one configuration for all skins
     (deploy/examples/robot.toml).
     """
+    from tactomo_client.messages import check_sensor_name
+
     from tactomo.acquisition import udev
     from tactomo.acquisition.adapters import list_adapters
     from tactomo.service.installation import plan_install
 
-    _check_name(name)
+    check_sensor_name(name, "skin")
     rules, names = udev.rules(name, port, list_adapters())
     root = root.absolute()
     plan = plan_install(name, names, rules, root, program or _program(dry_run))
@@ -84,10 +86,12 @@ def uninstall(
     root: Root = Path("/"),
 ) -> None:
     """Stop the service of a skin, or of all, and remove it. Configuration and recordings stay."""
+    from tactomo_client.messages import check_sensor_name
+
     from tactomo.service.installation import plan_uninstall
 
     if name is not None:
-        _check_name(name)
+        check_sensor_name(name, "skin")
     _carry_out(plan_uninstall(name, root.absolute()), dry_run)
 
 
@@ -97,18 +101,6 @@ def example() -> None:
     from tactomo.service.installation import shipped
 
     say(shipped("daemon.example.toml"), nl=False)
-
-
-def _check_name(name: str) -> None:
-    from tactomo_client import MessageError
-    from tactomo_client.messages import check_sensor_name
-
-    from tactomo.errors import ServiceError
-
-    try:
-        check_sensor_name(name)
-    except MessageError as error:
-        raise ServiceError(f"{name!r} is no name for a skin", error.next_step) from error
 
 
 def _program(dry_run: bool) -> str:
@@ -142,7 +134,6 @@ def _carry_out(plan: Plan, dry_run: bool) -> None:
 
 
 def _show(plan: Plan, with_text: bool) -> None:
-    """Print what a plan does; with the text of each file, if that is wanted."""
     for file in plan.files:
         effect = file.effect(plan.root)
         say(f"{effect:9}  {plan.root / file.path}")
