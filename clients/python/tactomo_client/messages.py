@@ -265,11 +265,7 @@ def age_at_receipt_ns(fields: dict[str, Any], received_ns: int | None) -> int:
     """
     acquired_ns: int | None = fields["acquired_monotonic_ns"]
     age_at_publication_ns: int | None = fields["age_ns"]
-    if received_ns is not None and acquired_ns is not None and is_our_clock(fields):
+    is_our_clock = bool(clock_id()) and fields.get("clock_id") == clock_id()
+    if received_ns is not None and acquired_ns is not None and is_our_clock:
         return max(0, received_ns - acquired_ns)
     return max(0, age_at_publication_ns or 0)
-
-
-def is_our_clock(fields: Mapping[str, Any]) -> bool:
-    """Whether a message was stamped by this computer's monotonic clock."""
-    return bool(clock_id()) and fields.get("clock_id") == clock_id()

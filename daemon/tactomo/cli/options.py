@@ -41,10 +41,6 @@ def method_names() -> list[str]:
     return [*METHODS, *_installed("tactomo.methods")]
 
 
-def _protocol_names() -> list[str]:
-    return _installed("tactomo.protocols")
-
-
 def _installed(group: str) -> list[str]:
     from importlib.metadata import entry_points
 
@@ -107,7 +103,10 @@ def _importable_protocol(name: str | None) -> str | None:
 def _protocol(default: str = "") -> Any:
     words = f"Protocol of the device: a name, or your own my_module:MyProtocol.{default}"
     return typer.Option(
-        "--protocol", help=words, autocompletion=_protocol_names, callback=_importable_protocol
+        "--protocol",
+        help=words,
+        autocompletion=lambda: _installed("tactomo.protocols"),
+        callback=_importable_protocol,
     )
 
 

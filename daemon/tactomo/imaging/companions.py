@@ -27,14 +27,12 @@ class Companions:
         if not self._companions:
             return []
         now_us, felt = dual.scans[0].device_us, dual.companions
-        self._tell_lost(now_us, {k for k, one in felt.items() if self._may_read(k, one.value)})
+        known = self._companions
+        self._tell_lost(now_us, {k for k, one in felt.items() if known[k].may_read(one.value)})
         return [
             CompanionReading(name, one.value, 1e-6 * now_us, 1e-6 * one.since_us)
             for name, one in felt.items()
         ]
-
-    def _may_read(self, name: str, value: float) -> bool:
-        return self._companions[name].may_read(value)
 
     def _tell_lost(self, now_us: int, usable: set[str]) -> None:
         for name in self._companions:

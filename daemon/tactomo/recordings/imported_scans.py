@@ -286,11 +286,6 @@ def _differences(
     return differences, _times(path, arrays, len(raw))
 
 
-def _phase_rad(volts: NDArray[Any]) -> float:
-    """Return the phase that complex volts of either sign have in common, within half a turn."""
-    return float(np.angle(np.nansum(volts**2))) / 2
-
-
 def _in_phase(
     path: Path, raw: NDArray[Any], turn_rad: float | None
 ) -> tuple[FloatArray, tuple[str, ...], float | None]:
@@ -299,7 +294,9 @@ def _in_phase(
         return np.asarray(raw, np.float64), (), None
     notes: tuple[str, ...] = ()
     if turn_rad is None:
-        turn_rad = -_phase_rad(raw) if _quadrature(raw) > MAX_QUADRATURE else 0.0
+        # Squares have a phase in common, whatever the sign of each: twice that of the volts.
+        phase_rad = float(np.angle(np.nansum(raw**2))) / 2
+        turn_rad = -phase_rad if _quadrature(raw) > MAX_QUADRATURE else 0.0
     if turn_rad:
         notes = (f"turned by {np.degrees(turn_rad):.0f} degrees, into phase with the current",)
         raw = raw * np.exp(1j * turn_rad)

@@ -84,7 +84,6 @@ from tactomo.stream.access_control import AccessControl, load_server_keys
 from tactomo.stream.control import (
     Control,
     Outcome,
-    RecordStart,
     SetBudget,
     SetTier,
     Settling,
@@ -217,7 +216,7 @@ class Daemon:
             {
                 "status": lambda _: self.status(),
                 "tare": lambda _: self._pipeline.tare(),
-                "record_start": self._record_start,
+                "record_start": lambda asked: self._recorder.begin(asked.path, asked.maps),
                 "record_stop": lambda _: self._recorder.end(),
                 "set_tier": self._set_tier,
                 "set_budget": self._set_budget,
@@ -403,9 +402,6 @@ class Daemon:
 
     def _summary(self) -> str:
         return self._status.summary(self._publisher.subscribers)
-
-    def _record_start(self, arguments: RecordStart) -> Future[Mapping[str, Any]]:
-        return self._recorder.begin(arguments.path, arguments.maps)
 
     def _set_tier(self, arguments: SetTier) -> Settling:
         method = arguments.tier
