@@ -189,6 +189,20 @@ Pose: TypeAlias = Annotated[
     str,
     typer.Option(metavar="X,Y,Z[,ROLL,PITCH,YAW]", help="Pose in that frame, metres and degrees."),
 ]
+TwinPorts: TypeAlias = Annotated[
+    int | None,
+    typer.Option(min=1, max=2, help="One line for both channels, or a line for each. [each]"),
+]
+Rate: TypeAlias = Annotated[float, typer.Option(help="Dual scans a second.")]
+KeptFile: TypeAlias = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", help="Keep it in this file. [where the daemon looks]"),
+]
+DryRun: TypeAlias = Annotated[bool, typer.Option("--dry-run", help="Do not keep the result.")]
+ShownFile: TypeAlias = Annotated[
+    Path | None,
+    typer.Argument(metavar="[FILE]", help="[the one that the sensor's daemon uses]"),
+]
 Force: TypeAlias = Annotated[
     bool, typer.Option("--force", "-f", help="Overwrite an existing file without asking.")
 ]

@@ -164,15 +164,6 @@ class ForeignCounts(DecoderCounts):
         return super().damaged + self.unreadable
 
 
-@dataclass(frozen=True, slots=True)
-class _Position:
-    """Where in its scans a foreign port is: what its bytes do not say."""
-
-    counter: int
-    device_us: int
-    clock_format: int
-
-
 class ForeignProtocol(PortProtocol):
     """What the protocols of other people's devices have in common; a subclass parses.
 
@@ -295,22 +286,17 @@ class ForeignProtocol(PortProtocol):
         if parts[0] or len(parts) < 5:
             return data
         rest = parts[4]
-        said = Decoder().feed(data[: len(data) - len(rest)])
-        position = _position(said)
-        if position is None:
-            return data
-        if self._has_greeted and self._counter == position.counter:
+        match Decoder().feed(data[: len(data) - len(rest)]):
+            case [Hello() as hello, UnknownPacket(type=0x70, body=body)] if (
+                len(body) == _POSITION.size
+            ):
+                counter, device_us, clock_format = _POSITION.unpack(body)
+            case _:
+                return data
+        if self._has_greeted and self._counter == counter:
             return b""
         self.restart()
-        self._counter, self.device_us = position.counter, position.device_us
-        self.clock_format = position.clock_format
+        self._counter, self.device_us, self.clock_format = counter, device_us, clock_format
         self._has_greeted, self._is_hello_due = True, False
-        packets.append(said[0])
+        packets.append(hello)
         return rest
-
-
-def _position(said: list[Packet]) -> _Position | None:
-    match said:
-        case [Hello(), UnknownPacket(type=0x70, body=body)] if len(body) == _POSITION.size:
-            return _Position(*_POSITION.unpack(body))
-    return None

@@ -157,7 +157,16 @@ class Daemon:
             config, description, self._description_file, replay
         )
         taught = _find_taught(config, description, replay, self._unused)
-        origin = _origin(config, protocol, description, calibration)
+        origin = Origin(
+            config.name,
+            config.description,
+            description.sha256,
+            config.ports,
+            version("tactomo"),
+            protocol,
+            calibration_text(calibration),
+            carried_text(description, config.description),
+        )
         self._recorder = Recorder(origin, config.recording, self._on_event)
         self._publisher = Publisher(
             config.name, self.session, self._status_fields, self._record_message, self._on_event
@@ -578,21 +587,3 @@ def _find_taught(
     except CalibrationError as error:
         unused.append(str(error))
         return None
-
-
-def _origin(
-    config: DaemonConfig,
-    protocol: str,
-    description: SensorDescription,
-    calibration: PressureCalibration | None,
-) -> Origin:
-    return Origin(
-        sensor=config.name,
-        description=config.description,
-        description_sha256=description.sha256,
-        ports=config.ports,
-        version=version("tactomo"),
-        protocol=protocol,
-        calibration=calibration_text(calibration),
-        description_text=carried_text(description, config.description),
-    )

@@ -17,6 +17,7 @@ from typing import Any, Final
 import zmq
 from tactomo_client import MessageError
 from tactomo_client.messages import CONTACTS, EVENT, STATUS, clock_id, encode_message, topic
+from tactomo_client.schema import Envelope, wire_fields
 
 from tactomo.events import OnEvent
 from tactomo.stream.access_control import STREAM
@@ -31,17 +32,8 @@ MAX_QUEUED: Final = 1024
 
 
 NO_FRAME_YET: Final[dict[str, Any]] = {
-    "acquired_realtime_ns": None,
-    "acquired_monotonic_ns": None,
-    "delay_ns": None,
-    "dated_by": None,
-    "device_us": None,
-    "skew_ms": None,
-    "tier": None,
-    "tier_reason": None,
+    **dict.fromkeys(wire_fields(Envelope)[2:]),  # after session and sequence
     "flags": [],
-    "misfit": None,
-    "confidence": None,
 }
 
 
@@ -96,11 +88,11 @@ class Publisher(Worker):
         self._socket = context.socket(zmq.XPUB)
         self._socket.setsockopt(zmq.SNDHWM, QUEUED_PER_SUBSCRIBER)
         self._readers = Subscribers(self._socket, endpoint, STREAM, self._on_event, secret)
-        self.address = self._readers.address
+        self.address = self._readers.peers.address
         self._bell = Bell()
 
     def _close(self) -> None:
-        self._readers.close()
+        self._readers.peers.close()
         self._socket.close(LINGER_MS)
         if self._bell is not None:
             self._bell.close()

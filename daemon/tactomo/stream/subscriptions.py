@@ -50,7 +50,6 @@ class Subscribers:
         socket.setsockopt(zmq.RCVHWM, 16)
         socket.setsockopt(zmq.MAXMSGSIZE, MAX_PREFIX_BYTES)
         self.peers = Peers(socket, endpoint, purpose, on_event, secret, option)  # the connections
-        self.address = self.peers.address  # where the socket is bound
         self.prefixes: Counter[bytes] = Counter()  # how many ask for each prefix
         self.cuts = 0  # how often all of them were cut off because there were too many
         self._socket = socket
@@ -76,13 +75,9 @@ class Subscribers:
             self.cuts += 1
             self.cut()
 
-    def close(self) -> None:
-        """Watch the connections no more; before the socket is closed."""
-        self.peers.close()
-
     def cut(self) -> None:
         """End every connection; those who may come back do so by themselves."""
-        rebind(self._socket, self.address)
+        rebind(self._socket, self.peers.address)
 
     def _count(self, joins: bool, prefix: bytes) -> tuple[bool, bytes]:
         change = 1 if joins else -1

@@ -52,7 +52,7 @@ class ZenohProxy(Relay):
         self._readers = Subscribers(
             self._outlet, self._endpoint, STREAM, self._on_event, None, "--bind"
         )
-        self.address = self._readers.address
+        self.address = self._readers.peers.address
         session = open_session(self._configuration, "connect")
         self._inlet = _Inlet(self._context, session, self.sources[0])
 
@@ -78,7 +78,7 @@ class ZenohProxy(Relay):
     def close(self) -> None:
         """Close everything, whatever `open` came to."""
         if self.address:
-            self._readers.close()
+            self._readers.peers.close()
             self._outlet.close(LINGER_MS)
         if self._inlet is not None:
             self._inlet.close()

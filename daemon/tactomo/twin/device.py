@@ -51,8 +51,7 @@ from tactomo.twin.converter import Converter
 from tactomo.twin.firmware import RATE_HZ_MAX, RATE_HZ_MIN, Firmware, Port, Voltages
 from tactomo.twin.foreign import Emulator, ForeignFirmware
 from tactomo.twin.line import SerialLine
-from tactomo.twin.scene import Scene, SkinDriftSettings
-from tactomo.twin.surface import Surface
+from tactomo.twin.scene import Indenter, Scene, SkinDriftSettings
 from tactomo.worker import Bell
 
 # How often a line that nobody has open is looked at; its hang-up cannot be waited on.
@@ -150,7 +149,9 @@ class Twin:
 
     def __init__(self, config: TwinConfig, skin: SkinModel | None = None) -> None:
         self.config = config
-        self._surface = Surface(config.scene)
+        self._script = config.scene
+        self._started_s: float | None = None  # when the script was started, by the device's clock
+        self._live: dict[str, Indenter] = {}  # what clients press, by id
         with contextlib.ExitStack() as undo:
             # What may be taken comes first: nobody likes to wait for a mesh to be told that.
             self._control = ControlSocket(config.control, self._handlers())
@@ -245,7 +246,8 @@ class Twin:
 
     def _sample(self, time_s: float) -> Future[Voltages]:
         """Start computing the voltages of the skin as it is at device time `time_s`."""
-        if not self._surface.is_playing and any(p.line.is_open for p in self._firmware.ports):
+        # A daemon that attaches later takes its reference from an unloaded skin, then sees all.
+        if self._started_s is None and any(p.line.is_open for p in self._firmware.ports):
             self._play_at(time_s)
         presses = self._presses_at(time_s)
         future: Future[Voltages]
@@ -257,7 +259,13 @@ class Twin:
         return future
 
     def _presses_at(self, time_s: float) -> list[Press]:
-        return [indenter.press() for indenter in self._surface.presses_at(time_s).values()]
+        return [indenter.press() for indenter in self._indenters_at(time_s).values()]
+
+    def _indenters_at(self, time_s: float) -> dict[str, Indenter]:
+        """Return what presses the skin, by id; live presses go before the script's."""
+        if self._script is None or self._started_s is None:
+            return dict(self._live)
+        return self._script.presses_at(max(0.0, time_s - self._started_s)) | self._live
 
     def _read_companions(self, time_s: float, counter: int) -> list[CompanionReading]:
         """Return what companions read; only a simulated skin knows the force on it."""
@@ -268,8 +276,7 @@ class Twin:
 
     def _play_at(self, time_s: float) -> None:
         """Start the scripted scene; it may say how the skin drifts."""
-        self._surface.play(time_s)
-        script = self._surface.script
+        self._started_s, script = time_s, self._script
         if script is not None and script.drift is not None and self._drifting is not None:
             self._drifting.drift = script.drift.skin_drift()
 
@@ -333,7 +340,7 @@ class Twin:
         }
 
     def _scene(self, _: Nothing) -> dict[str, Any]:
-        presses = self._surface.presses_at(self._clock())
+        presses = self._indenters_at(self._clock())
         return {
             "presses": [
                 {"id": name, **indenter.model_dump(exclude={"id"})}
@@ -343,7 +350,7 @@ class Twin:
 
     def _press(self, arguments: PressArguments) -> dict[str, Any]:
         self._check_touches(arguments)
-        self._surface.press(arguments.id, arguments)
+        self._live[arguments.id] = arguments
         return {}
 
     def _check_touches(self, arguments: PressArguments) -> None:
@@ -360,18 +367,18 @@ class Twin:
             )
 
     def _release(self, arguments: ReleaseArguments) -> dict[str, Any]:
-        return {"released": self._surface.release(arguments.id)}
+        return {"released": self._live.pop(arguments.id, None) is not None}
 
     def _clear(self, _: Nothing) -> dict[str, Any]:
-        self._surface.clear()
+        self._live.clear()
         return {}
 
     def _play(self, arguments: PlayArguments) -> dict[str, Any]:
-        self._surface.script = arguments.scene or self._surface.script
-        if self._surface.script is None:
+        self._script = arguments.scene or self._script
+        if self._script is None:
             raise CommandError("the twin has no scripted scene", "give one as `scene`")
         self._play_at(self._clock())
-        return {"length_s": self._surface.script.length_s}
+        return {"length_s": self._script.length_s}
 
     def _set_noise(self, arguments: NoiseArguments) -> dict[str, Any]:
         self._converter.noise_v = arguments.noise_v

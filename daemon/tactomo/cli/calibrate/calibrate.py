@@ -49,10 +49,6 @@ AreaMm2 = Annotated[
     float | None,
     typer.Option("--area-mm2", min=1.0, max=1e6, help="Area of an indenter of another shape."),
 ]
-Output = Annotated[
-    Path | None,
-    typer.Option("--output", "-o", help="Keep it in this file. [where the daemon looks]"),
-]
 Picture = Annotated[Path | None, picture_option("Draw readings and curve")]
 
 
@@ -68,7 +64,7 @@ def live(
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Begin anew, without earlier readings.")
     ] = False,
-    output: Output = None,
+    output: options.KeptFile = None,
     address: options.Address = None,
     keys: options.KeysFolder = None,
 ) -> None:
@@ -119,8 +115,8 @@ def fit(
         typer.Option(help="Device of the calibration, without a recording; repeat."),
     ] = None,
     picture: Picture = None,
-    output: Output = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Do not keep the result.")] = False,
+    output: options.KeptFile = None,
+    dry_run: options.DryRun = False,
     keep_odd: Annotated[
         bool, typer.Option("--keep-odd", help="Keep lines that the other lines contradict.")
     ] = False,
@@ -171,10 +167,7 @@ def fit(
     )
 )
 def show(
-    file: Annotated[
-        Path | None,
-        typer.Argument(metavar="[FILE]", help="[the one that the sensor's daemon uses]"),
-    ] = None,
+    file: options.ShownFile = None,
     sensor: options.Sensor = None,
     picture: Picture = None,
 ) -> None:

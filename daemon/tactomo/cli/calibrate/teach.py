@@ -37,10 +37,6 @@ app = options.typer_app(
     ),
 )
 
-Output = Annotated[
-    Path | None,
-    typer.Option("--output", "-o", help="Keep it in this file. [where the daemon looks]"),
-]
 KeepOdd = Annotated[
     bool, typer.Option("--keep-odd", help="Keep presses that the other presses contradict.")
 ]
@@ -58,7 +54,7 @@ def live(
         typer.Option(metavar="FILE.npz", help="File for the presses. [beside the taught model]"),
     ] = None,
     description: options.GivenDescription = None,
-    output: Output = None,
+    output: options.KeptFile = None,
     keep_odd: KeepOdd = False,
     address: options.Address = None,
     keys: options.KeysFolder = None,
@@ -92,8 +88,8 @@ def fit(
     device_id: Annotated[
         list[str] | None, typer.Option(help="Device of the calibration; repeat.")
     ] = None,
-    output: Output = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Do not keep the result.")] = False,
+    output: options.KeptFile = None,
+    dry_run: options.DryRun = False,
     keep_odd: KeepOdd = False,
     address: options.Address = None,
     keys: options.KeysFolder = None,
@@ -119,10 +115,7 @@ def fit(
 
 @app.command(epilog=options.examples("tactomo teach show --sensor left_forearm"))
 def show(
-    file: Annotated[
-        Path | None,
-        typer.Argument(metavar="[FILE]", help="[the one that the sensor's daemon uses]"),
-    ] = None,
+    file: options.ShownFile = None,
     sensor: options.Sensor = None,
 ) -> None:
     """Show a skin's taught model: its presses and its errors."""

@@ -19,20 +19,13 @@ if TYPE_CHECKING:
 
     from tactomo.cli.doctor.evidence import Evidence
 
-COLOURS = {
-    "ok": "green",
-    "unknown": None,
-    "advice": "yellow",
-    "fault": "red",
-    "broken": "red",
-}
-MARKS = {"ok": "", "unknown": "? ", "advice": "! ", "fault": "✗ ", "broken": "✗ "}
-VERDICTS = {
-    "ok": "healthy",
-    "advice": "healthy",
-    "fault": "ill",
-    "broken": "broken",
-    "unknown": "unknown",
+# Of each level: colour and mark of a line, verdict in a word, and what follows the verdict.
+LEVELS = {
+    "ok": ("green", "", "healthy", ""),
+    "unknown": (None, "? ", "unknown", ": too little is known"),
+    "advice": ("yellow", "! ", "healthy", ", with some advice"),
+    "fault": ("red", "✗ ", "ill", ": follow the next steps of the lines marked ✗"),
+    "broken": ("red", "✗ ", "broken", ": no reading of this device can be trusted"),
 }
 
 app = options.typer_app()
@@ -130,7 +123,7 @@ def doctor(
         print_json(report(evidence, channels, line, verdict))
     else:
         _print(evidence, channels, line, verdict)
-    raise typer.Exit(0 if VERDICTS[verdict] == "healthy" else 1)
+    raise typer.Exit(0 if LEVELS[verdict][2] == "healthy" else 1)
 
 
 def _of_file(
@@ -185,10 +178,10 @@ def report(
     return {
         "examined": evidence.title,
         "notes": list(evidence.notes),
-        "verdict": VERDICTS[verdict],
+        "verdict": LEVELS[verdict][2],
         "channels": {
             name: {
-                "verdict": VERDICTS[diagnosis.level],
+                "verdict": LEVELS[diagnosis.level][2],
                 "electrodes": list(diagnosis.electrodes),
                 "findings": [_plain(finding) for finding in diagnosis.findings],
                 "snr_db": diagnosis.snr_db.round(2).tolist(),
@@ -220,23 +213,16 @@ def _print(
         _print_findings(name, diagnosis.findings)
     if line:
         _print_findings("stream", line)
-    typer.secho(f"\n{VERDICTS[verdict]}", fg=COLOURS[verdict], bold=True, nl=False)
-    say("" if verdict == "ok" else _why(verdict))
-
-
-def _why(verdict: Level) -> str:
-    return {
-        "advice": ", with some advice",
-        "fault": ": follow the next steps of the lines marked ✗",
-        "broken": ": no reading of this device can be trusted",
-        "unknown": ": too little is known",
-    }[verdict]
+    colour, _, word, more = LEVELS[verdict]
+    typer.secho(f"\n{word}", fg=colour, bold=True, nl=False)
+    say(more)
 
 
 def _print_findings(title: str, findings: Sequence[Finding]) -> None:
     say(f"\n{title}")
     for finding in findings:
-        about = f"{MARKS[finding.level]}{finding.about.replace('_', ' ')}: {finding.detail}"
-        typer.secho(f"  {plain(about)}", fg=COLOURS[finding.level])
+        colour, mark, _, _ = LEVELS[finding.level]
+        about = f"{mark}{finding.about.replace('_', ' ')}: {finding.detail}"
+        typer.secho(f"  {plain(about)}", fg=colour)
         if finding.next_step:
             say(f"      {finding.next_step}")

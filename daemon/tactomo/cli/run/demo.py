@@ -41,11 +41,8 @@ def demo(
     sensor: options.NewName = options.DEFAULT_NAME,
     description: options.Description = options.DEFAULT_DESCRIPTION,
     method: options.GivenMethod = None,
-    ports: Annotated[
-        int | None,
-        typer.Option(min=1, max=2, help="One line for both channels, or a line for each. [each]"),
-    ] = None,
-    rate: Annotated[float, typer.Option(help="Dual scans a second.")] = 20.0,
+    ports: options.TwinPorts = None,
+    rate: options.Rate = 20.0,
     scene: Annotated[
         Path | None, typer.Option(help="A scripted scene, shipped or TOML, that presses by itself.")
     ] = None,

@@ -22,11 +22,8 @@ app = options.typer_app()
 )
 def twin(
     description: options.Description = options.DEFAULT_DESCRIPTION,
-    ports: Annotated[
-        int | None,
-        typer.Option(min=1, max=2, help="One line for both channels, or a line for each. [each]"),
-    ] = None,
-    rate: Annotated[float, typer.Option(help="Dual scans a second.")] = 20.0,
+    ports: options.TwinPorts = None,
+    rate: options.Rate = 20.0,
     protocol: options.Protocol = "tactomo",
     scene: Annotated[
         Path | None,
