@@ -182,15 +182,11 @@ class Robot(BaseModel):
 
 
 def load_config(path: str | Path | None = None, **overrides: Any) -> DaemonConfig:
-    """Read a configuration file and apply options to it.
+    """Read a configuration file, None for defaults alone, and apply options to it.
 
-    Args:
-        path: a TOML file; None for defaults and options alone.
-        **overrides: values that win over the file's; None means "not given". A key of a table is
-            written with a dot: ``recording.file``.
-
-    Raises ConfigError where the file cannot be read or is not TOML, or a key is unknown, missing or
-    out of range.
+    An override wins over the file; None means "not given". A key of a table is written with a dot:
+    ``recording.file``. Raises ConfigError where the file cannot be read or is not TOML, or a key is
+    unknown, missing or out of range.
     """
     given = {key: value for key, value in overrides.items() if value is not None}
     values = {} if path is None else _read_toml(Path(path))

@@ -16,15 +16,15 @@ class Worker:
     """One thread; a subclass has the work in `_run`, which returns soon once `_stopping` is set.
 
     An exception that ends the thread is in the log; then `is_alive` is False.
-
-    Args:
-        name: the thread's.
-        join_s: how long `stop` waits for the thread at most, in seconds, where it may hang in the
-            operating system; None to wait until it ends.
     """
 
-    def __init__(self, name: str, join_s: float | None = None) -> None:
-        self.name = name  # the thread's
+    def __init__(
+        self,
+        name: str,  # the thread's
+        # how long `stop` waits for a thread that may hang in the operating system; None: for ever
+        join_s: float | None = None,
+    ) -> None:
+        self.name = name
         self.turns = 0  # how often the thread went round its loop; the watchdog goes by them
         self._join_s = join_s
         self._stopping = threading.Event()

@@ -49,9 +49,7 @@ class BridgeError(ClientError):
 class Bridge:
     """Serves one or several sensors of one stream. Use it in a `with` block.
 
-    Raises:
-        BridgeError: the address cannot be listened on.
-        ClientError: a name is no sensor's, or `stream` no address.
+    Raises BridgeError where the address is unusable, ClientError for a bad name or stream.
     """
 
     def __init__(

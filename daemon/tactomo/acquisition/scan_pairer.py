@@ -41,14 +41,12 @@ class ScanPairer:
     """Turns single scans into dual scans. For use by one thread; others may read.
 
     Every scan that is pushed waits, is part of one dual scan, or is counted in one of these.
-
-    Attributes:
-        late: scans dropped because their dual scan, or their channel, had gone on without them.
-        disordered: how many of the late ones came after their own channel's next.
     """
 
     def __init__(self) -> None:
         self.lost: set[Channel] = set()  # channels that nobody waits for at present
+        # scans dropped because their dual scan, or channel, had gone on without them; and those of
+        # them that came after their own channel's next
         self.late = self.disordered = 0
         self.repeated = 0  # scans dropped because they had come before
         self.unmarked = 0  # scans dropped because the recorded run did not use them

@@ -24,12 +24,7 @@ class Effort(NamedTuple):
 
 
 class MethodInForce:
-    """Tells the reconstructor its method and budget.
-
-    Attributes:
-        requested: what was asked for; the budget in milliseconds of this machine.
-        effective: what frames get; the budget in milliseconds of modelled work.
-    """
+    """Tells the reconstructor its method and budget."""
 
     def __init__(self, reconstructor: Reconstructor, machine_speed: MachineSpeed) -> None:
         self.share = 1.0  # of the time that was asked for, what frames get
@@ -37,6 +32,7 @@ class MethodInForce:
         self._reconstructor = reconstructor
         self._machine_speed = machine_speed
         budget_s = reconstructor.budget_s
+        # what was asked for, in milliseconds of this machine; what frames get, of modelled work
         self.requested = self.effective = Effort(
             reconstructor.method, None if budget_s is None else budget_s * 1e3
         )

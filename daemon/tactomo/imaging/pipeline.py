@@ -53,13 +53,7 @@ class _SyncState(NamedTuple):
 
 
 class Pipeline(Worker):
-    """`start` it, `deliver` to it, `stop` it.
-
-    Attributes:
-        delivered_ns: when the newest scan was delivered, monotonic; 0 before the first.
-        incomplete: dual scans of which one channel did not come that had come before, or is lost.
-        finished: set while every replayed port is at its end, once what came of it was published.
-    """
+    """`start` it, `deliver` to it, `stop` it."""
 
     def __init__(
         self,
@@ -73,9 +67,10 @@ class Pipeline(Worker):
         on_event: OnEvent,
     ) -> None:
         super().__init__("pipeline")
-        self.delivered_ns = 0
-        self.incomplete = 0
+        self.delivered_ns = 0  # when the newest scan was, monotonic; 0 before the first
+        self.incomplete = 0  # dual scans without a channel that had come before, or is lost
         self.scan_rates = {channel: Rate() for channel in channels}
+        # set while every replayed port is at its end, once what came of it was published
         self.finished = threading.Event()
         self._imaging = imaging
         self._channels = channels

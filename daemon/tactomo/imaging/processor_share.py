@@ -28,14 +28,11 @@ MAX_HOLD_S: Final = 80.0
 
 
 class ProcessorShare:
-    """For use by one thread.
-
-    Attributes:
-        of_core: what share of a core the thread got of late while it computed.
-        of_time: what share of its time a frame is left: 1, 1/2, ... LEAST.
-    """
+    """For use by one thread."""
 
     def __init__(self) -> None:
+        # the share of a core that the thread got of late while it computed; and the share of its
+        # time that a frame is left: 1, 1/2, ... LEAST
         self.of_core = self.of_time = 1.0
         self._cpu_s = self._wall_s = 0.0
         self._dropped = self._frames = 0

@@ -169,14 +169,8 @@ class ForeignProtocol(PortProtocol):
 
     It makes up what such a device does not say: the hello, from the sensor's description, before
     the first scan, and the scans' counter, which goes on over all connections. The device carries
-    the description's only channel.
-
-    Args:
-        description: the sensor; its scans are float32 volts in the description's order.
-        rate_hz: scans a second, 0 where only the device knows.
-
-    Raises:
-        ConfigError: the description has two channels, or more voltages than a scan can have.
+    the description's only channel; its scans are float32 volts in the description's order.
+    Raises ConfigError where the description has two channels, or more voltages than a scan.
     """
 
     device_id: ClassVar[str]  #: what the device is called in `status`

@@ -55,11 +55,8 @@ def read_eit_files(paths: Sequence[Path]) -> dict[str, NDArray[Any]]:
     """Return the frames of .eit files in the order of their dates.
 
     `volts` (T, injections, channels) complex, `injection` (injections, 2) from 1, `t` (T,) seconds
-    since 1970, as if the dates in the files were UTC.
-
-    Raises:
-        EitFileError: one of them cannot be read, is none, or is of another measurement; it says
-            which line is wrong.
+    since 1970, as if the dates in the files were UTC. Raises EitFileError, which names the line,
+    where one of them cannot be read, is none, or is of another measurement.
     """
     frames = [_read(path) for path in paths]
     for path, frame in zip(paths, frames, strict=True):

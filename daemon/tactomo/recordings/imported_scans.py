@@ -62,23 +62,15 @@ class ImportFileError(TactomoError):
 
 @dataclass(frozen=True)
 class Scans:
-    """Scans of one sensor.
+    """Scans of one sensor."""
 
-    Attributes:
-        volts: (T, M) volts of each channel there is, in the description's order.
-        time_s: (T,) seconds, rising, from 0; None where the file does not say.
-        reference: (M,) or (n, M) volts of each channel whose unloaded scans the file holds.
-        notes: what a user should know about how the file was read.
-        turned_rad: the angle that complex volts were turned by.
-        companions: (T,) readings of companions by name; NaN where there was none.
-        companions_at_rest: readings of companions with nothing on the skin, by name.
-    """
-
-    volts: Mapping[Channel, FloatArray]
-    time_s: FloatArray | None
+    volts: Mapping[Channel, FloatArray]  # (T, M) in the description's order
+    time_s: FloatArray | None  # (T,) rising, from 0; None where the file does not say
+    # (M,) or (n, M) volts of each channel whose unloaded scans the file holds
     reference: Mapping[Channel, FloatArray] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    turned_rad: float | None = None
+    notes: tuple[str, ...] = ()  # what a user should know about how the file was read
+    turned_rad: float | None = None  # the angle that complex volts were turned by
+    # (T,) readings by name, NaN where there was none; and those with nothing on the skin
     companions: Mapping[str, FloatArray] = field(default_factory=dict)
     companions_at_rest: Mapping[str, float] = field(default_factory=dict)
 
@@ -157,25 +149,16 @@ class Scans:
 def read_scans(
     path: Path | Sequence[Path],
     description: SensorDescription,
-    channel: Channel | None,
+    channel: Channel | None,  # of a file of one channel; None for the sensor's only one
     *,
-    array: str | None = None,
-    pattern: NamedPattern | None = None,
-    turn_rad: float | None = None,
+    array: str | None = None,  # of plain scans; None for the only one that fits
+    pattern: NamedPattern | None = None,  # of plain scans in another order than the sensor's
+    turn_rad: float | None = None,  # to turn complex volts by; None for their own angle
 ) -> Scans:
-    """Read the scans of a measurement.
+    """Read the scans of a measurement, the file or files of `load_arrays`.
 
-    Args:
-        path: as of `load_arrays`.
-        description: the sensor, whose pattern the voltages follow.
-        channel: which channel a file of one channel holds; None for the sensor's only one.
-        array: name of the scans, where the layout is plain; None for the only one that fits.
-        pattern: of plain scans, where the order differs from the description's.
-        turn_rad: angle to turn complex volts by, such as the reference's; None for their own.
-
-    Raises:
-        ImportFileError, EitFileError, DataError: it cannot be read, is of no layout, or does not
-            fit the sensor.
+    Raises ImportFileError, EitFileError or DataError where it cannot be read, is of no layout, or
+    does not fit the sensor.
     """
     arrays = load_arrays(path)
     path = path if isinstance(path, Path) else path[0]

@@ -244,9 +244,8 @@ class Recorder(Worker):
     ) -> ActiveRecording:
         """Begin a file, the next one of the folder if none is named.
 
-        Raises:
-            RecordingError: it cannot be created, or less than so many reserves are free.
-            OSError: the folder cannot be read.
+        Raises RecordingError where it cannot be created or the disk lacks room, OSError where the
+        folder cannot be read.
         """
         folder = self._rules.folder_path if path is None else path.parent
         free, reserve = self._room(folder)

@@ -276,9 +276,7 @@ def write_recording(
     # the reference to be used on replay; None leaves that to the replay's tare
     reference: Reference | None = None,
 ) -> int:
-    """Write a recording of scans that came from elsewhere, as one port would have said them.
-
-    Returns the length of the file in bytes.
+    """Write scans that came from elsewhere, as one port would have said them; return its bytes.
 
     Raises RecordingError where the file exists or cannot be written.
     """

@@ -67,10 +67,8 @@ class Replay:
 class ReplayClock:
     """How far a replay is, on the recording's own clock. For use by one thread.
 
-    Args:
-        ports: how many ports are replayed.
-        is_paced: whether their bytes come in their own time. Ports that are read as fast as they
-            are taken run ahead of one another: only what the slowest one has passed is over.
+    Ports that are read as fast as they are taken, not paced, run ahead of one another: only what
+    the slowest one has passed is over.
     """
 
     def __init__(self, ports: int, is_paced: bool) -> None:

@@ -41,16 +41,11 @@ def notify(*lines: str) -> None:
 
 
 class Supervision:
-    """Feeds the watchdog and the status line; for the main thread, which calls `turn` often.
-
-    Args:
-        turns: returns how often each part's thread went round its loop, of those that should.
-        summary: returns how the daemon is, in one line.
-    """
+    """Feeds the watchdog and the status line; for the main thread, which calls `turn` often."""
 
     def __init__(self, turns: Callable[[], Mapping[str, int]], summary: Callable[[], str]) -> None:
-        self._turns = turns
-        self._summary = summary
+        self._turns = turns  # how often each part's thread went round its loop
+        self._summary = summary  # how the daemon is, in one line
         self._period_s = watchdog_s()
         self._fed_s = self._told_s = time.monotonic()
         self._at_feed = turns()

@@ -41,10 +41,6 @@ class Peers:
     """The connections of a socket, which it binds; for the socket's thread.
 
     Arguments and errors are those of `tactomo.endpoint.bind`; `on_event` is told of who was cut.
-
-    Attributes:
-        address: where the socket is bound.
-        monitor: a socket that is readable when a connection comes or goes.
     """
 
     def __init__(
@@ -59,6 +55,7 @@ class Peers:
         self._socket = socket
         self._purpose = purpose
         self._on_event = on_event
+        # readable when a connection comes or goes
         self.monitor = socket.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
         self._connections: dict[int, _Connection] = {}  # by descriptor
         self._is_discarding = False

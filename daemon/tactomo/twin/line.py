@@ -30,18 +30,11 @@ HOLDER_WAIT_S = 1.0
 
 
 class SerialLine:
-    """The device's end of one line. For use by one thread.
-
-    Attributes:
-        name: what the line carries, for people and for the name of the link; no two twins that
-            run have the same link.
-        sent: frames handed to the line whole.
-        dropped: frames lost because the line was full.
-        unheard: frames lost because nobody had the port open, or the cable was out.
-    """
+    """The device's end of one line. For use by one thread."""
 
     def __init__(self, name: str, link_folder: Path | None = None) -> None:
-        self.name = name
+        self.name = name  # what the line carries; no two twins that run have the same link
+        # frames handed over whole; lost to a full line; lost to nobody who had the port open
         self.sent = self.dropped = self.unheard = 0
         self._link = None if link_folder is None else link_folder / name
         self._claim = None if self._link is None else _claim(self._link)

@@ -66,9 +66,7 @@ def guided(
 ) -> PressureCalibration:
     """Take readings together with the user, and fit them; `status` is the daemon's.
 
-    Raises:
-        TactomoError: the sensor has no magnitude channel.
-        CalibrationError: what was taken makes no curve yet.
+    Raises TactomoError without a magnitude channel, CalibrationError where readings are too few.
     """
     from tactomo_models.calibration.calibration_file import SUFFIX, PressureCalibration
 

@@ -312,10 +312,8 @@ def of_arrays(
 ) -> Evidence:
     """Read a file of arrays as `tactomo reconstruct` does; see `tactomo doctor --help`.
 
-    Raises:
-        DoctorError: it holds nothing that can be examined.
-        ImportFileError, EitFileError: it cannot be read, or does not fit the description.
-        DataError: the scans fit no pattern.
+    Raises DoctorError, ImportFileError, EitFileError or DataError where it cannot be read or
+    examined, or its scans fit no description or pattern.
     """
     arrays = load_arrays(path)
     is_batch = array is None and bool(arrays.keys() & set(Channel))

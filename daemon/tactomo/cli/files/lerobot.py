@@ -101,10 +101,8 @@ def write_dataset(
 ) -> tuple[int, list[str]]:
     """Write a dataset; return how many steps there are, and what did not fit, a sentence each.
 
-    LeRobot holds an episode in memory: some 40 kB for each step.
-
-    Raises:
-        TactomoError: there is no map, the clock that is aligned by was set, or no rate is known.
+    LeRobot holds an episode in memory: some 40 kB for each step. Raises TactomoError where there is
+    no map, the clock that is aligned by was set, or no rate is known.
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from tactomo_client.touch import Touch
