@@ -17,7 +17,6 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
-from types import TracebackType
 from typing import Any, Self
 
 from tactomo.cli.parent_watch import VARIABLE
@@ -161,12 +160,7 @@ class Family:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         with no_interruption():
             # The last one started first: whoever reads stops before what is read from.
             deadline_s = time.monotonic() + STOP_S
