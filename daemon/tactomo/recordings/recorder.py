@@ -79,9 +79,8 @@ class Recorder(Worker):
     def start(self) -> None:
         """Start the thread, and what is to be recorded from the start.
 
-        Raises:
-            RecordingError: the file to be recorded to cannot be created. A folder that cannot be
-                used, or a disk without room, is told as an event and tried again.
+        Raises RecordingError where the file cannot be created. A folder that cannot be used, or a
+        disk without room, is told as an event and tried again.
         """
         super().start()
         if self._rules.file is not None:
