@@ -263,6 +263,12 @@ def long_eit(path: Path) -> None:
     path.write_text("\n".join(lines))
 
 
+def crowded_eit(path: Path) -> None:
+    """As many injections as fit."""
+    head = ["9", "name", "2024.01.31. 12:30:05.250", "1", "1", "0", "1", "1", "1"]
+    path.write_text("\n".join(head) + "\n1 2\n1 1" * (2 * MEGABYTE - 20))
+
+
 def pipe(path: Path) -> None:
     """A pipe that nobody writes to."""
     os.mkfifo(path)
@@ -311,6 +317,7 @@ CORPUS: Final[dict[str, Callable[[Path], None]]] = {
     "title.toml": titled_description,
     "deep.json": deep_json,
     "long.eit": long_eit,
+    "crowd.eit": crowded_eit,
     **{f"pipe{suffix}": pipe for suffix in (".npz", ".mat", ".csv", ".eit", ".mcap", ".toml")},
     **{f"device{suffix}": endless for suffix in (".npz", ".mat", ".csv", ".eit", ".mcap", ".toml")},
     "folder.mcap": folder,

@@ -27,6 +27,8 @@ SUFFIX: Final = ".eit"
 HEADERS: Final = (9, 11, 18)
 MEASURED: Final = "MeasurementChannels"
 MAX_BYTES: Final = 1 << 24
+MAX_CHANNELS: Final = 256  # of Sciospec's largest instrument
+MAX_LINES: Final = 2 * MAX_CHANNELS**2
 _DATES: Final = ("%Y.%m.%d. %H:%M:%S.%f", "%Y.%m.%d. %H:%M:%S")
 _ANOTHER: Final = "is it a Sciospec file? Other programs have a format of that name, too"
 
@@ -39,7 +41,7 @@ class EitFileError(TactomoError):
 
 class _Frame(NamedTuple):
     injection: list[tuple[int, int]]
-    volts: list[list[complex]]
+    volts: NDArray[np.complex128]  # (injections, channels)
     time_s: float
 
 
@@ -60,14 +62,14 @@ def read_eit_files(paths: Sequence[Path]) -> dict[str, NDArray[Any]]:
     """
     frames = [_read(path) for path in paths]
     for path, frame in zip(paths, frames, strict=True):
-        if frame.injection != frames[0].injection or len(frame.volts[0]) != len(frames[0].volts[0]):
+        if frame.injection != frames[0].injection or frame.volts.shape != frames[0].volts.shape:
             raise EitFileError(
                 f"{path} and {paths[0]} have different injections or channels",
                 "import each measurement by itself",
             )
     frames.sort(key=lambda frame: frame.time_s)
     return {
-        "volts": np.array([frame.volts for frame in frames], dtype=np.complex128),
+        "volts": np.array([frame.volts for frame in frames]),
         "injection": np.array(frames[0].injection),
         "t": np.array([frame.time_s for frame in frames]),
     }
@@ -77,10 +79,12 @@ def _read(path: Path) -> _Frame:
     step = f"give the path of a {SUFFIX} file"
     try:
         with os_errors_as(EitFileError, f"cannot read {path}", step):
-            lines = read_regular(path, MAX_BYTES).decode("ascii").splitlines()
+            text = read_regular(path, MAX_BYTES).decode("ascii").rstrip()
     except UnicodeDecodeError as error:
         raise EitFileError(f"{path} is not text", _ANOTHER) from error
-    return _Lines(path, lines).frame()
+    if text.count("\n") > MAX_LINES:
+        raise EitFileError(f"{path} has more than {MAX_LINES} lines", _ANOTHER)
+    return _Lines(path, text.split("\n")).frame()
 
 
 class _Lines:
@@ -103,15 +107,13 @@ class _Lines:
             )
         time_s = self._date(first + 1)
         injection: list[tuple[int, int]] = []
-        volts: list[list[complex]] = []
+        volts: list[NDArray[np.complex128]] = []
         for number in range(int(header) + 1, len(self._lines) + 1, 2):
-            if not "".join(self._lines[number - 1 :]).strip():
-                break
             injection.append(self._pair(number))
             volts.append(self._potentials(number + 1, len(volts[0]) if volts else None))
         if not injection:
             raise self._wrong(int(header) + 1, "no injection", "it was cut off: save it anew")
-        return self._measured(int(header), _Frame(injection, volts, time_s))
+        return self._measured(int(header), _Frame(injection, np.array(volts), time_s))
 
     def _measured(self, header: int, frame: _Frame) -> _Frame:
         """Leave out the channels that the header does not name, and number the others from 1."""
@@ -120,7 +122,7 @@ class _Lines:
             channels = [int(digits) for digits in re.findall(r"\d+", listed)]
             if word != MEASURED or not channels:
                 continue
-            columns = len(frame.volts[0])
+            columns = frame.volts.shape[1]
             if columns == len(channels):
                 places = list(range(columns))
             elif 0 < min(channels) <= max(channels) <= columns:
@@ -136,8 +138,7 @@ class _Lines:
                     f"channel {error} is injected at, not measured",
                     "measure all electrodes",
                 ) from None
-            volts = [[row[place] for place in places] for row in frame.volts]
-            return frame._replace(injection=injection, volts=volts)
+            return frame._replace(injection=injection, volts=frame.volts[:, places])
         return frame
 
     def _text(self, number: int) -> str:
@@ -167,17 +168,20 @@ class _Lines:
             raise self._wrong(number, f"{source} {sink} is no injection")
         return source, sink
 
-    def _potentials(self, number: int, count: int | None) -> list[complex]:
+    def _potentials(self, number: int, count: int | None) -> NDArray[np.complex128]:
+        words = self._text(number).split(maxsplit=2 * MAX_CHANNELS)
+        if len(words) > 2 * MAX_CHANNELS:
+            raise self._wrong(number, f"more than {MAX_CHANNELS} channels", _ANOTHER)
         try:
-            values = [float(each) for each in self._text(number).split()]
+            values = np.array([float(each) for each in words])
         except ValueError:
             raise self._wrong(number, "a value is not a number") from None
-        if len(values) % 2 or not values or (count is not None and len(values) != 2 * count):
+        if len(values) % 2 or not len(values) or (count is not None and len(values) != 2 * count):
             wanted = "pairs of numbers" if count is None else f"{2 * count} numbers"
             raise self._wrong(number, f"{len(values)} numbers, not {wanted}")
         if not np.isfinite(values).all():
             raise self._wrong(number, "a value is not a finite number")
-        return [complex(*pair) for pair in zip(values[::2], values[1::2], strict=True)]
+        return values.view(np.complex128)
 
     def _wrong(self, number: int, cause: str, next_step: str = "save it anew") -> EitFileError:
         return EitFileError(f"{self._path}, line {number}: {cause}", next_step)

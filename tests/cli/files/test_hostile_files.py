@@ -18,7 +18,7 @@ from hostile_files import CORPUS
 from tactomo_models import SkinSimulator, load_description
 
 QUICK: Final = {
-    "info": ("boastful.npz", "markup.mcap", "marks.mcap", "pipe.csv"),
+    "info": ("boastful.npz", "crowd.eit", "markup.mcap", "marks.mcap", "pipe.csv"),
     "plot": ("timeless.mcap",),
     "replay": ("piped.mcap",),
     "reconstruct": ("pipe.npz",),
