@@ -138,7 +138,7 @@ class DaemonConfig(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     # Encrypt ``tcp://`` addresses and let in the listed clients only; needed beyond loopback
     curve: Curve | None = None
     method: MethodName = "auto"  # how to reconstruct: a method's name, or ``my_module:MyMethod``
-    # Time that one reconstruction may take; None leaves it to the method
+    # Work that one frame may take, in ms of a 2.5 GHz core; None leaves it to the method
     budget_ms: BudgetMs | None = None
     tare_scans: Annotated[int, Field(ge=2, le=10_000)] = 20  # dual scans averaged into a reference
     # How long a scan waits for the other channel's scan of the same instant

@@ -15,7 +15,6 @@ from tactomo.log import configure_logging
 from tactomo.recordings.recording_set import open_replayable
 from tactomo.service.daemon import Daemon
 from tactomo_client import Keys
-from tactomo_models.methods.machine_speed import MachineSpeed
 from waiting import wait_until
 
 
@@ -57,10 +56,9 @@ def make_skin() -> Iterator[Callable[[Path, int], Any]]:
 def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Callable[..., Any]]:
     """Start a daemon: ``bench(ports=1, **config)``; everything is stopped later.
 
-    It has the reconstructor above, each frame of which takes `seconds`, or the `real` one; and a
-    `machine_speed`, or this machine's. A scan waits for its partner as long as it takes, unless
-    there is a `sync_wait_ms`. What listens to it and asks it has `keys`.
-    The cables are in, unless `is_plugged` says otherwise.
+    It has the reconstructor above, each frame of which takes `seconds`, or the `real` one. A scan
+    waits for its partner as long as it takes, unless there is a `sync_wait_ms`. What listens to it
+    and asks it has `keys`. The cables are in, unless `is_plugged` says otherwise.
     """
     daemons: list[Daemon] = []
     listeners: list[Listener] = []
@@ -69,7 +67,6 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
         ports: int = 1,
         seconds: float = 0.0,
         real: bool = False,
-        machine_speed: MachineSpeed | None = None,
         keys: Keys | None = None,
         is_plugged: bool = True,
         **config: Any,
@@ -93,7 +90,7 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
         if "sync_wait_ms" not in config:
             loaded = loaded.model_copy(update={"sync_wait_ms": PATIENT_SYNC_MS})
         memory: Any = None if real else Memory(seconds)
-        daemon = Daemon(loaded, reconstructor=memory, machine_speed=machine_speed)
+        daemon = Daemon(loaded, reconstructor=memory)
         daemon.start()
         daemons.append(daemon)
         listener = Listener(daemon.stream_address, "left", keys=keys)
@@ -110,17 +107,13 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
 
 @pytest.fixture
 def replay(tmp_path: Path) -> Callable[..., Any]:
-    """Replay a recording to its end: ``replay(path, speed=0, **config)`` returns what was said.
-
-    With a `machine_speed`, or this machine's.
-    """
+    """Replay a recording to its end: ``replay(path, speed=0, **config)`` returns what was said."""
     count = itertools.count()
 
     def run(
         path: Path,
         speed: float = 0,
         real: bool = False,
-        machine_speed: MachineSpeed | None = None,
         **config: Any,
     ) -> Heard:
         out = tmp_path / f"replayed-{next(count)}.mcap"
@@ -136,9 +129,7 @@ def replay(tmp_path: Path) -> Callable[..., Any]:
             **config,
         }
         memory: Any = None if real else Memory()
-        daemon = Daemon(
-            load_config(None, **settings), reconstructor=memory, machine_speed=machine_speed
-        )
+        daemon = Daemon(load_config(None, **settings), reconstructor=memory)
         daemon.start()
         try:
             assert daemon.wait() == 0

@@ -170,7 +170,7 @@ class MethodInForce:
 
 @dataclass(frozen=True, slots=True)
 class BudgetInForce:
-    """How long a frame may take from now on."""
+    """How much work a frame may take from now on."""
 
     budget_ms: float | None  #: None for the method's own
 
@@ -313,7 +313,7 @@ class Daemon(Control):
     set_tier = set_method  # as the stream calls it
 
     def set_budget(self, budget_ms: float | None) -> BudgetInForce:
-        """Choose how long a frame may take, ms; None leaves it to the method.
+        """Choose the work of a frame, in ms of a 2.5 GHz core; None leaves it to the method.
 
         Raises:
             BadArgument: not more than 0.

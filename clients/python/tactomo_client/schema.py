@@ -685,10 +685,10 @@ class Plan:
     """What frames are given for the method and the budget that were asked for."""
 
     tier: str = ""  #: the method in use
-    modelled_ms: float | None = None  #: expected work, in milliseconds of a 2.5 GHz core
-    #: fraction of the requested time; below 1 while other programs use the processor
+    #: work, in milliseconds of a 2.5 GHz core; nil: the method's own
+    modelled_ms: float | None = None
+    #: fraction of the requested work; below 1 while other programs use the processor
     share: float = 1.0
-    source: str = ""  #: origin of the speed estimate of this machine, in words
 
 
 @dataclass(frozen=True, slots=True)
@@ -830,7 +830,8 @@ class Status(Received):
     #: at the daemon's start
     methods: tuple[str, ...] = ()
     tier_requested: str = ""  #: The requested method, one of `methods`
-    budget_ms: float | None = None  #: Requested time per frame; nil: the method's own
+    #: Requested work per frame, in milliseconds of a 2.5 GHz core; nil: the method's own
+    budget_ms: float | None = None
     #: Method and work in force, from `tier_requested` and `budget_ms`
     plan: Plan = field(default_factory=Plan)
     recording: RecordingProgress | None = None  #: Nil when nothing is recorded

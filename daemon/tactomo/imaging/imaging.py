@@ -24,7 +24,6 @@ from tactomo_models import (
 from tactomo_models.calibration.calibration_file import PressureCalibration
 from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_models.commissioning.known_skin import SkinAtStart, skin_at_start
-from tactomo_models.methods.machine_speed import MachineSpeed
 from tactomo_models.scans.companion_forces import CompanionReading
 from tactomo_models.scans.tare import Tare
 from tactomo_protocol import Channel, ScanFlag
@@ -68,7 +67,6 @@ class Imaging:
         self,
         description: SensorDescription,  # the sensor
         reconstructor: Reconstructor,  # belongs to this class from now on
-        machine_speed: MachineSpeed,  # what turns a budget of time into one of work
         # of pressure, the sensor's own; None for the description's curve
         calibration: PressureCalibration | None,
         taught: TaughtSkin | None,  # what the sensor was taught; None where nothing was
@@ -92,7 +90,7 @@ class Imaging:
             BaselineTracker(reconstructor, baseline.time_constant_s) if baseline.track else None
         )
         self._marks = FrameMarks(recorder)
-        self.method = MethodInForce(reconstructor, machine_speed)  # requested and effective
+        self.method = MethodInForce(reconstructor)  # requested and effective
         # of pressure, the one in force
         self.calibration = CalibrationInForce(
             description, reconstructor, recorder, on_event, calibration, taught
@@ -290,7 +288,7 @@ class Imaging:
         self.taring.add(volts, lost, self._contacts, companions)
 
     def share_processor(self, dropped: int) -> None:
-        """Give frames less time where others take the processor, and more where they do no longer.
+        """Give frames less work where others take the processor, and more where they do no longer.
 
         To be called after `process`, with how many dual scans were left out since the start.
         """
@@ -306,13 +304,13 @@ class Imaging:
                 "processor_shared",
                 "other programs use the processor: this skin got "
                 f"{processor.of_core:.0%} of a core while it computed, and frames get "
-                f"{share:.0%} of their time",
-                "give the daemon more of the processor, or fewer skins; frames then get their time "
+                f"{share:.0%} of their work",
+                "give the daemon more of the processor, or fewer skins; frames then get their work "
                 "back",
                 reason=f"{share}",
             )
         elif share == 1:
-            self._on_event("processor_free", "frames get all of their time")
+            self._on_event("processor_free", "frames get all of their work")
 
     def _doubted(self, frame: Reconstruction, doubt: Doubt) -> Reconstruction:
         """Flag a frame, unless it ends the doubt: the skin is again as it was known."""

@@ -1,8 +1,8 @@
 """The method and the budget that were requested, and those that frames get.
 
-A budget is milliseconds of this machine; the machine's speed turns it into milliseconds of modelled
-work, less of it where others take the processor. Recordings hold what was effective, so that a
-replay gives the same on any machine. For use by the pipeline thread; others may read.
+A budget is milliseconds of modelled work (`field_fit.Budget`), less of it where others take the
+processor. Recordings hold what was effective, so that a replay gives the same on any machine. For
+use by the pipeline thread; others may read.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from tactomo_models import Reconstructor
-from tactomo_models.methods.machine_speed import MachineSpeed
 from tactomo_models.reconstruct import DEFAULT_BUDGET_S
 
 from tactomo.errors import CommandError
@@ -20,19 +19,17 @@ class Effort(NamedTuple):
     """How much model a frame gets."""
 
     method: str
-    budget_ms: float | None  # None for the method's own
+    budget_ms: float | None  # of modelled work; None for the method's own
 
 
 class MethodInForce:
     """Tells the reconstructor its method and budget."""
 
-    def __init__(self, reconstructor: Reconstructor, machine_speed: MachineSpeed) -> None:
-        self.share = 1.0  # of the time that was asked for, what frames get
-        self.source = machine_speed.source  # where the machine's speed is known from, in words
+    def __init__(self, reconstructor: Reconstructor) -> None:
+        self.share = 1.0  # of the work that was asked for, what frames get
         self._reconstructor = reconstructor
-        self._machine_speed = machine_speed
         budget_s = reconstructor.budget_s
-        # what was asked for, in milliseconds of this machine; what frames get, of modelled work
+        # what was asked for; what frames get
         self.requested = self.effective = Effort(
             reconstructor.method, None if budget_s is None else budget_s * 1e3
         )
@@ -53,11 +50,11 @@ class MethodInForce:
             ) from error
 
     def request_budget(self, budget_ms: float | None) -> None:
-        """Have frames take as much time; None for the method's own."""
+        """Have frames take as much work; None for the method's own."""
         self._request(self.requested._replace(budget_ms=budget_ms))
 
     def give_share(self, share: float) -> None:
-        """Have frames take that share of the time that was asked for, or of the method's own."""
+        """Have frames take that share of the work that was asked for, or of the method's own."""
         self.share = share
         self._request(self.requested)
 
@@ -68,11 +65,10 @@ class MethodInForce:
             self.requested = recorded
 
     def _request(self, requested: Effort) -> None:
-        time_s = None if requested.budget_ms is None else requested.budget_ms * 1e-3
+        budget_ms = requested.budget_ms
         if self.share < 1:
-            time_s = self.share * (time_s or DEFAULT_BUDGET_S)
-        modelled_ms = None if time_s is None else self._machine_speed.budget_s(time_s) * 1e3
-        self.put_in_force(Effort(requested.method, modelled_ms))
+            budget_ms = self.share * (budget_ms or DEFAULT_BUDGET_S * 1e3)
+        self.put_in_force(Effort(requested.method, budget_ms))
         self.requested = requested
 
     def lengthen(self, budget_ms: float) -> None:

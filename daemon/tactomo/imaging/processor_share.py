@@ -1,7 +1,7 @@
-"""How much of its time a frame is left where others take the processor.
+"""How much of its work a frame is left where others take the processor.
 
 Where many scans are left out because this thread did not get the processor that it asked for,
-frames get half of their time, then a quarter, and so on, and twice as much again when few have been
+frames get half of their work, then a quarter, and so on, and twice as much again when few have been
 left out for a while. Every skin of a busy computer does so; that each gets a fair share of the
 processor is the system's scheduler's work. What one skin asks for with a processor of its own is
 the budget's business.

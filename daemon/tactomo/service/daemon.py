@@ -56,7 +56,6 @@ from tactomo_models.calibration.calibration_file import (
     load_calibration,
 )
 from tactomo_models.calibration.taught_skin import TaughtSkin, load_taught, taught_path
-from tactomo_models.methods.machine_speed import MachineSpeed, machine_speed_for
 from tactomo_models.methods.registry import available_methods, check_method
 from tactomo_models.sensor.description_file import carried_text
 from tactomo_protocol import Channel
@@ -115,9 +114,6 @@ class Daemon:
         # what makes maps of voltages; by default the description's own, with an artifact that is
         # built if need be. Only that one can tell a load at the start by the reference of before
         reconstructor: Reconstructor | None = None,
-        # what turns a budget of time into one of work; by default what was measured on this
-        # machine, if that was
-        machine_speed: MachineSpeed | None = None,
         # the description's; by default read, and built if need be
         artifact: Artifact | None = None,
         # what the sensor is made of, where a recording carries that; by default as configured
@@ -175,10 +171,6 @@ class Daemon:
         self._imaging = Imaging(
             description,
             reconstructor or _make_reconstructor(config, description, artifact),
-            machine_speed
-            or machine_speed_for(
-                description, lambda why: log.warning("machine_speed_unused", detail=why)
-            ),
             calibration,
             taught,
             config.tare_scans,

@@ -161,7 +161,6 @@ class Status:
         method = self._imaging.method
         tier, modelled_ms = method.effective
         return {
-            "source": method.source,
             "tier": tier,
             "modelled_ms": modelled_ms,
             "share": method.share,

@@ -6,13 +6,14 @@ moving ones, all with reporting seeds.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rich.progress import Progress
-from tactomo.cli.bench.machine_speed import warned_if_busy
 from tactomo.cli.console import Console
 from tactomo.cli.output import say, table
 from tactomo.cli.plot.plot import prepare_picture, save_figure
@@ -31,6 +32,7 @@ STILL_SNR_DB: Final = (40.0, 20.0, 10.0)
 CONTACTS: Final = 4  # mixed scenes have one to so many, in turns
 SCENES_A_SEQUENCE: Final = 5  # a sequence has some 100 frames
 SEEDS: Final = "reporting"
+BUSY: Final = 0.8  # share of a core below which times are those of whatever else ran
 MEASURES: Final = (
     "frames",
     "icc",
@@ -100,7 +102,7 @@ def measure_chart(
     ]
     frames = sum(len(case.frames) for case in moving)
     progress = Progress(console=Console(stderr=True), transient=True)
-    with warned_if_busy() as warnings, progress:
+    with _warned_if_busy() as warnings, progress:
         for cases, budgets_s in (
             *((each, trade_off.STILL_BUDGETS_S) for each in drawn),
             (moving, trade_off.BUDGETS_S),
@@ -112,6 +114,25 @@ def measure_chart(
             task = progress.add_task(what, total=total)
             points += trade_off.measure(cases, asked, partial(progress.advance, task))
     return points, warnings
+
+
+@contextmanager
+def _warned_if_busy() -> Iterator[list[str]]:
+    """Say on standard error if this process had to wait for others while it measured times.
+
+    The list that the block gets holds the same words at its end, for what else shows the times.
+    """
+    wall_s, own_s = time.perf_counter(), time.process_time()
+    warnings: list[str] = []
+    yield warnings
+    share = (time.process_time() - own_s) / (time.perf_counter() - wall_s)
+    if share < BUSY:
+        busy = (
+            f"the machine was busy: this process had {share:.0%} of a core, so its times are "
+            "too long"
+        )
+        warnings.append(busy)
+        say(f"{busy}; run it again when nothing else runs", err=True)
 
 
 def rows_of(points: Sequence[trade_off.Point]) -> list[dict[str, Any]]:

@@ -10,15 +10,8 @@ import pytest
 Run = Callable[..., Any]
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        ["--machine-speed", "--chart", "chart.png"],
-        ["--method", "tikhonov"],
-    ],
-)
-def test_options_that_do_not_go_together(tactomo: Run, options: list[str]) -> None:
-    assert tactomo("bench", *options).returncode == 2
+def test_a_method_goes_with_the_chart(tactomo: Run) -> None:
+    assert tactomo("bench", "--method", "tikhonov").returncode == 2
 
 
 def test_without_the_laboratory_the_chart_says_how_to_get_it(

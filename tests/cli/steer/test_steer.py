@@ -43,7 +43,7 @@ STATUS = {
     "tier": "levelset",
     "tier_requested": "auto",
     "budget_ms": 12.0,
-    "plan": {"source": "measured here", "tier": "fit", "modelled_ms": 4.5},
+    "plan": {"tier": "fit", "modelled_ms": 6.0, "share": 0.5},
     "flags": ["structure_missing"],
     "misfit": 1.02,
     "dropped_scans": 2,
@@ -94,7 +94,7 @@ def test_status_shows_what_matters(tactomo: Run, control: Any) -> None:
         *("refused: [neither] contact nor drift", "magnitude drifted by -1.23%, unevenly by 0.09%"),
         "cell reads 255.5: 127.0 ± 2.5 N, not used: it contradicts the sheets",
         "pad no reading within its limits",
-        "12 ms: fit, 4.50 modelled ms; machine speed: measured here",
+        "12 ms of work, 50% of it while other programs use the processor",
     ):
         assert words in result.stdout
 

@@ -2,8 +2,8 @@
 
 *Live*: a twin and a daemon as processes of their own, and this process as the subscriber; latency
 is from the moment at which the daemon has read the last byte of a dual scan to the arrival of its
-contacts here, by the clock that both processes share. *Machine speed* is
-`tactomo.cli.bench.machine_speed`'s; *chart* is the laboratory's, see `tactomo.cli.laboratory`.
+contacts here, by the clock that both processes share. *Chart* is the laboratory's, see
+`tactomo.cli.laboratory`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import typer
 
 from tactomo.cli import options
 from tactomo.cli.laboratory import measurement
-from tactomo.cli.output import print_json, say, table
+from tactomo.cli.output import print_json, table
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -37,7 +37,7 @@ SETTLE_S = 1.5
 STATUS_S = 13.0  # at 20 dual scans a second: as far back as the stage times in a status go
 START_S = 60.0
 PLACES = ((0.0, 0.1), (-0.45, -0.4), (0.5, -0.35))  # in shares of half the sheet's size
-LIVE, CHART, SPEED = "Live", "Speed against accuracy", "Machine speed"
+LIVE, CHART = "Live", "Speed against accuracy"
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,6 @@ app = options.typer_app()
         "tactomo bench --json > times.json",
         "tactomo bench --chart speed_accuracy.png --count 25",
         "tactomo bench --chart mine.png --method my_module:MyMethod --method auto",
-        "tactomo bench --machine-speed",
     )
 )
 def bench(
@@ -109,15 +108,6 @@ def bench(
     method: Annotated[
         list[str] | None, options.methods_option(" [every installed one]", rich_help_panel=CHART)
     ] = None,
-    machine_speed: Annotated[
-        bool,
-        typer.Option(
-            "--machine-speed",
-            rich_help_panel=SPEED,
-            help="Instead, measure what a budget of time buys here, and keep it for "
-            "daemons that start from now on.",
-        ),
-    ] = False,
     as_json: options.JsonOutput = False,
 ) -> None:
     """Measure latency and rate on this machine, or the accuracy of methods over their time.
@@ -129,22 +119,12 @@ def bench(
     (reporting seeds): still scenes at 40, 20 and 10 dB, each from a cold start, and moving scenes,
     under budgets of 1 to 50 ms, still ones also of 2 s. Takes about a quarter of an hour, longer
     when the scenes must be simulated first.
-
-    With `--machine-speed`, `auto` follows one moving scene under several budgets, and the measured
-    times are kept in the cache beside the sensor's models. Daemons that start later keep a budget
-    of time on this machine. Takes about half a minute; leave the machine alone meanwhile. A service
-    has a cache of its own: set CACHE_DIRECTORY to that cache.
     """
-    if machine_speed and chart is not None:
-        raise typer.BadParameter("use --machine-speed and --chart in separate runs")
     if method and chart is None:
         raise typer.BadParameter("--method goes with --chart")
     results = Results(machine(), description)
     if chart is not None:
         _chart(results, chart, count, method or [], as_json)
-        return
-    if machine_speed:
-        _machine_speed(results, as_json)
         return
     from tactomo.cli.console import Console
 
@@ -164,21 +144,6 @@ def _chart(results: Results, picture: Path, count: int, methods: list[str], as_j
         print_json(asdict(results))
     else:
         _console(results).print(fronts)
-
-
-def _machine_speed(results: Results, as_json: bool) -> None:
-    from tactomo.cli.bench import machine_speed as bench_machine_speed
-
-    made = bench_machine_speed.measure(results.description)
-    if as_json:
-        say(made.model_dump_json(indent=2))
-        return
-    console = _console(results)
-    console.print(bench_machine_speed.table_of(made))
-    console.print(
-        f"This machine's speed: {made.source}. A frame takes {made.overhead_s * 1e3:.1f} ms and "
-        f"{made.speed:.2f} times its modelled budget (p99)."
-    )
 
 
 def _measure_twin(
@@ -335,9 +300,17 @@ def _stage_table(phases: list[Phase]) -> Table:
 def machine() -> str:
     """Return the processor, its cores that we may use, and the versions that matter."""
     import numpy as np
-    from tactomo_models.methods.machine_speed import processor
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return (
-        f"{processor()}, {cores} cores, Python {platform.python_version()}, NumPy {np.__version__}"
+        f"{_processor()}, {cores} cores, Python {platform.python_version()}, NumPy {np.__version__}"
     )
+
+
+def _processor() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(": ")[2]
+    return platform.processor() or platform.machine()

@@ -45,7 +45,8 @@ def daemon(
     protocol: options.GivenProtocol = None,
     method: options.GivenMethod = None,
     budget_ms: Annotated[
-        float | None, typer.Option(help="Time per frame. [the method's own]")
+        float | None,
+        typer.Option(help="Work per frame, in ms of a 2.5 GHz core. [the method's own]"),
     ] = None,
     stream: Annotated[
         str | None, typer.Option(help=f"Address of the stream. [{options.DEFAULT_STREAM}]")

@@ -173,15 +173,10 @@ def _port_line(port: dict[str, Any]) -> str:
 
 
 def _budget(budget_ms: float | None, plan: dict[str, Any]) -> str:
-    """Say what time a frame may take, and what it is given for that."""
-    source = f"machine speed: {plan.get('source', '-')}"
+    """Say how much work a frame may take."""
     share = plan.get("share", 1.0)
     left = f", {share:.0%} of it while other programs use the processor" if share < 1 else ""
-    time = "the method's own" if budget_ms is None else f"{budget_ms:g} ms"
-    if budget_ms is None and not left:
-        return f"{time}; {source}"
-    given = f"{plan.get('tier')}, {_number(plan.get('modelled_ms'))} modelled ms"
-    return f"{time}{left}: {given}; {source}"
+    return ("the method's own" if budget_ms is None else f"{budget_ms:g} ms of work") + left
 
 
 def _percentiles(times: dict[str, Any]) -> str:

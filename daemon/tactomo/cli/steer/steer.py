@@ -126,7 +126,9 @@ def method(
             autocompletion=options.method_names,
         ),
     ],
-    budget_ms: Annotated[float | None, typer.Option(min=0.1, help="Time per frame.")] = None,
+    budget_ms: Annotated[
+        float | None, typer.Option(min=0.1, help="Work per frame, in ms of a 2.5 GHz core.")
+    ] = None,
     sensor: options.Sensor = None,
     address: options.Address = None,
     keys: options.KeysFolder = None,
