@@ -79,7 +79,16 @@ def subscribe(
 def subscribe(
     sensor: str, *, kind: Kind | tuple[Kind, ...] = "map", **options: Unpack[Options]
 ) -> Subscription[Any]:
-    """Subscribe as `tactomo_client.subscribe` does, within an event loop."""
+    """Subscribe to one sensor's frames, as `tactomo_client.subscribe` does, within an event loop.
+
+    Arguments and errors are the same.
+
+    Example::
+
+        async with subscribe("left_forearm") as skin:
+            async for frame in skin:
+                ...
+    """
     return Subscription(sensor, kind, **options)
 
 
@@ -93,18 +102,33 @@ class Subscription(Reception[T_co], AsyncIterator[T_co]):
         return _open(zmq.SUB)
 
     async def __anext__(self) -> T_co:
-        """Wait for the next frame; errors are those of `tactomo_client.Subscription`."""
+        """Wait for the next frame, in an `async for` or with `anext`.
+
+        Raises:
+            StreamTimeout: it does not come within `timeout_s`.
+            KeysError: the server does not let this client in. The next call knocks once more.
+        """
         item = await _wait(self._arrival(self.timeout_s))
         if item is not None:
             return item
         raise self._end() or StopAsyncIteration
 
     async def wait(self, timeout_s: float) -> T_co | None:
-        """Wait for the next frame, but no longer than `timeout_s`; None if it has not come then."""
+        """Wait for the next frame, but no longer than `timeout_s`; None if it has not come then.
+
+        0 or less, what is left of a time that is over, takes a frame that has come.
+
+        Raises:
+            KeysError: the server does not let this client in. The next call knocks once more.
+        """
         return await _wait(self._arrival(checked_seconds("timeout_s", timeout_s, past=True)))
 
     async def latest(self) -> T_co | None:
-        """Return the newest frame there is, after other tasks had a turn; None before the first."""
+        """Return the newest frame there is, without waiting for one; None before the first one.
+
+        The same frame comes again when no newer one has arrived: look at `Frame.is_stale`. Other
+        tasks have their turn meanwhile.
+        """
         await asyncio.sleep(0)
         return self._latest()
 
@@ -174,7 +198,7 @@ class Daemon(Control):
         return to_status(await self.request("status"))
 
     async def tare(self, timeout_s: float = TARE_TIMEOUT_S) -> Tare:
-        """Take a new reference of the *unloaded* skin."""
+        """Take a new reference: the next scans of the *unloaded* skin count as nothing pressed."""
         return filled(Tare, await self.request("tare", timeout_s))
 
     async def record_start(

@@ -36,8 +36,11 @@ def map_pixels(frame: Frame, description: Mapping[str, Any]) -> NDArray[np.uint8
     """Return the colours of the map's nodes (ny, nx, 3), row 0 at the bottom; None without a map.
 
     Colour is pressure, or the relative change where the sensor has no pressure calibration, or how
-    surely a node is pressed. What is pressed without a value is blue-grey. `description` is the
-    sensor, as `status` has it, or empty.
+    surely a node is pressed. What is pressed without a value is blue-grey.
+
+    Args:
+        frame: a frame with images.
+        description: the sensor, as `status` has it; may be empty.
     """
     shown = shown_image(frame, description)
     if shown is None:
@@ -109,10 +112,15 @@ def surface_points(
     x_share: NDArray[np.float64],
     y_share: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return where on a mounted sheet's surface places are: their shape and 3, metres, by the link.
+    """Return where on a mounted sheet's surface places are, linear between the status's points.
 
-    Between the points (rows, columns, 3) of a status's ``description.mount`` it is linear; places
-    are shares from the left edge to the right one and from the bottom to the top, 0 to 1.
+    Args:
+        surface_m: of a status's ``description.mount``, (rows, columns, 3).
+        x_share: how far from the left edge to the right one, 0 to 1; any shape.
+        y_share: how far from the bottom to the top, likewise.
+
+    Returns:
+        Points in the frame of the mount's link, metres: that shape and 3.
     """
     points = np.asarray(surface_m, dtype=float)
     rows, columns, _ = points.shape
@@ -163,7 +171,11 @@ class Placement:
 
     @classmethod
     def parse(cls, parent: str, pose: str) -> Self:
-        """Return what "X,Y,Z" or "X,Y,Z,ROLL,PITCH,YAW" (m, degrees) means, or raise ValueError."""
+        """Return the placement that "X,Y,Z" (m) or "X,Y,Z,ROLL,PITCH,YAW" (m, degrees) means.
+
+        Raises:
+            ValueError: it is neither.
+        """
         numbers = [float(number) for number in pose.split(",")]
         if len(numbers) not in (3, 6) or not all(math.isfinite(number) for number in numbers):
             raise ValueError("give X,Y,Z or X,Y,Z,ROLL,PITCH,YAW, in metres and degrees")

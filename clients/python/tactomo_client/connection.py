@@ -72,7 +72,11 @@ class Connection:
             raise
 
     def connect(self) -> None:
-        """Connect, when all options are set; raise ControlError where the address is none."""
+        """Connect, when all options are set.
+
+        Raises:
+            ControlError: the address is none.
+        """
         try:
             self.socket.connect(self.address)
         except zmq.ZMQError as error:
@@ -109,7 +113,11 @@ class Connection:
             return None
 
     def heard(self, wait_s: float) -> Iterator[Message]:
-        """Yield the intact messages that come within `wait_s`; raise KeysError if not let in."""
+        """Yield the messages that have come, after a wait for the first, but malformed ones.
+
+        Raises:
+            KeysError: the server does not let this client in.
+        """
         wait_ms = round(wait_s * 1e3)
         while self.socket.poll(wait_ms):
             wait_ms = 0

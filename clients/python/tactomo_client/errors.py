@@ -128,10 +128,18 @@ class RecordingError(ClientError):
 def checked_seconds(
     name: str, value: object, *, endless: bool = True, zero: bool = True, past: bool = False
 ) -> float:
-    """Return a time in seconds as a float; `name` is the argument's, for the error.
+    """Return a time in seconds as a float.
 
-    `endless` allows infinity, `zero` 0, and `past` less: what is left of a time that is over.
-    Raises TypeError where it is no number, ValueError where it is NaN or makes no sense.
+    Args:
+        name: of the argument, for the error.
+        value: what was given for it.
+        endless: whether infinity makes sense.
+        zero: whether 0 does.
+        past: whether less does: what is left of a time that is over.
+
+    Raises:
+        TypeError: it is no number.
+        ValueError: it is NaN, or makes no sense.
     """
     if not isinstance(value, Real) or isinstance(value, bool):
         raise TypeError(f"{name} = {value!r} is no number: give seconds, such as 0.5")

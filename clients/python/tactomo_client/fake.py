@@ -66,9 +66,15 @@ class FakeSensor:
     ) -> None:
         """Publish one frame, as `map` and as `contacts`.
 
-        Images are float32 (ny, nx); `x_mm` and `y_mm` are the positions of their first and last
-        column and row. `changes` are fields to send otherwise than they would be, for example
-        ``flags=["magnitude_missing"]`` or an old ``acquired_monotonic_ns``.
+        Args:
+            contacts: what is pressed.
+            map: float32 image (ny, nx), as are `pressure_kpa` and `structure`.
+            pressure_kpa: see `map`.
+            structure: see `map`.
+            x_mm: positions of the images' first and last column.
+            y_mm: positions of the images' first and last row.
+            **changes: fields to send otherwise than they would be, for example
+                ``flags=["magnitude_missing"]`` or an old ``acquired_monotonic_ns``.
         """
         wire = [dataclasses.asdict(contact) for contact in contacts]
         images = {"map": map, "pressure_kpa": pressure_kpa, "structure": structure}

@@ -82,7 +82,11 @@ class Received:
 
 
 def filled(cls: type[T], fields: Mapping[str, Any], /, **own: Any) -> T:
-    """Return a dataclass with the values of a map, and `own` ones; else raise MessageError."""
+    """Return a dataclass with the values of a map, and those of its `own` that no message has.
+
+    Raises:
+        MessageError: a field is missing that has no default, or is of the wrong type.
+    """
     kind: Any = cls
     readers, required = readers_of(kind)
     if missing := required - fields.keys() - own.keys():

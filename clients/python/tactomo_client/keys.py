@@ -78,7 +78,8 @@ def read_public(path: Path) -> bytes:
 def read_secret(path: Path) -> tuple[bytes, bytes]:
     """Return the public and the secret key in a file that nobody but its owner may read.
 
-    Raises KeysError where it cannot be read, holds no secret key, or others may read it.
+    Raises:
+        KeysError: it cannot be read, holds no secret key, or others may read it.
     """
     public, secret = _read(path)
     if secret is None:

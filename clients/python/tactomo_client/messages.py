@@ -148,8 +148,9 @@ def encode_error(name: str, cause: str, next_step: str = "") -> bytes:
 def decode_reply(data: bytes) -> dict[str, Any]:
     """Return the result in a control reply.
 
-    Raises ControlError where the command was refused, in the server's words, and MessageError where
-    the bytes are no reply.
+    Raises:
+        ControlError: the command was refused; name, cause and next step are the server's.
+        MessageError: the bytes are no reply.
     """
     fields = _unpack_map(data)
     result, error = fields.get("result"), fields.get("error")

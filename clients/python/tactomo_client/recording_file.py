@@ -74,8 +74,13 @@ def records(
 ) -> Iterator[tuple[str, McapRecord]]:
     """Yield the file's records up to its end or to the first damage; messages with their topic.
 
-    `on_damage` is told where the last thing that could be read ends; `wants` says whether a chunk
-    but the first, which names topics, is to be unpacked. Raises RecordingError for no MCAP file.
+    Args:
+        path: the file.
+        on_damage: told where the last thing that could be read ends.
+        wants: whether a chunk is to be unpacked; the first one is in any case, for it names topics.
+
+    Raises:
+        RecordingError: the file cannot be opened, or is no MCAP file.
     """
     topics: dict[int, str] = {}
     with open_file(path) as file:
@@ -144,7 +149,11 @@ def messages_beyond(path: Path, start: int) -> Iterator[tuple[str, Message]]:
 
 
 def read_metadata(path: Path) -> Mapping[str, str]:
-    """Return what a recording's file says of itself; raise RecordingError where it is not ours."""
+    """Return what the recording in a file says of itself.
+
+    Raises:
+        RecordingError: the file cannot be opened, or is no recording of tactomo's.
+    """
     header = None
     for _, record in records(path):
         if isinstance(record, Header):
@@ -207,7 +216,11 @@ class IntactChunk(NamedTuple):
 
 
 def intact_chunks(file: IO[bytes], start: int = 0) -> Iterator[IntactChunk]:
-    """Yield every chunk from `start` on that its CRC confirms; raise OSError as the disk does."""
+    """Yield every chunk from `start` on that its CRC confirms.
+
+    Raises:
+        OSError: the disk cannot read it.
+    """
     waste = max(_LEAST_WASTE, _MAX_WASTE * file.seek(0, os.SEEK_END))
     end = 0  # of what was intact
     for mark in _marks(file, start + _BEFORE_MARK):

@@ -110,7 +110,11 @@ class Reception(Generic[T_co]):
         self._connection.close()
 
     def _arrival(self, timeout_s: float | None) -> Waiting[T_co | None]:
-        """Wait for the next item; the outcome is None after `timeout_s`, or when this is closed."""
+        """Wait for the next item; the outcome is None after `timeout_s`, or when this is closed.
+
+        Raises:
+            KeysError: the server does not let this client in. The next call knocks once more.
+        """
         connection = self._connection
         deadline_s = math.inf if timeout_s is None else time.monotonic() + timeout_s
         while connection.is_open:

@@ -72,7 +72,11 @@ class Touch:
         self._traces = Traces()
 
     def arrays(self, frame: Frame | None) -> dict[str, NDArray[Any]]:
-        """Return what a frame (or None) shows; raise ValueError for maps of another shape."""
+        """Return what a frame shows; None: that there is none.
+
+        Raises:
+            ValueError: its maps are of another shape.
+        """
         table = np.zeros((self._rows, len(CONTACT_COLUMNS)))
         is_number = np.zeros(table.shape, np.uint8)
         for contact, trace in self._traces.of(frame) if frame else ():

@@ -27,8 +27,19 @@ def write_bag(
     """Write frames as a bag, and return how many there were; a chunk at a time is in memory.
 
     A message's time in the bag is when its frame was published, its stamp when the frame was
-    acquired: the difference is the age. Where the age is not known, both are the same. Raises
-    OSError where the bag cannot be written, WriterError where it is there already.
+    acquired: the difference is the age. Where the age is not known, both are the same.
+
+    Args:
+        frames: when each was acquired, nanoseconds since 1970; the frame; and how old it was when
+            it was published, seconds, if that is known.
+        folder: the bag, which must not be there yet; its files have its name.
+        sensor: the sensor's name.
+        placement: where the sensor hangs; None writes no transform for that.
+        mount: the link that carries the sheet; None: the map is flat, in the sensor's own frame.
+
+    Raises:
+        OSError: the bag cannot be written.
+        rosbags.rosbag2.WriterError: it is there already.
     """
     count = 0
     bag = Writer(folder, version=VERSION, storage_plugin=StoragePlugin.MCAP)

@@ -29,7 +29,11 @@ class Channel(StrEnum):
 
     @classmethod
     def of_number(cls, number: int) -> Channel:
-        """Return the channel of a number on the wire; raise ValueError where none has it."""
+        """Return the channel that a number on the wire means.
+
+        Raises:
+            ValueError: none has that number.
+        """
         if number not in range(len(_CHANNELS)):
             raise ValueError(f"no channel has the number {number}")
         return _CHANNELS[number]
