@@ -65,12 +65,16 @@ def _array(stored: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
 def map_array(path: Path, name: str) -> NDArray[Any]:
     """One array of an uncompressed .npz file, in the file: what nobody reads of it takes no memory.
 
-    Checks nothing: for files that `read_arrays` has read. An array at an odd place is copied.
+    For files that `read_arrays` has read. An array at an odd place is copied. Raises ValueError for
+    a compressed one.
     """
     with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as member:
         np.lib.format.read_magic(member)
         shape, _, dtype = np.lib.format.read_array_header_1_0(member)
-        start, header = archive.getinfo(f"{name}.npy").header_offset, member.tell()
+        info, header = archive.getinfo(f"{name}.npy"), member.tell()
+    if info.compress_type != zipfile.ZIP_STORED:
+        raise ValueError(f"{name} is compressed")
+    start = info.header_offset
     with path.open("rb") as file:
         file.seek(start + 26)  # lengths of the name and of the field that end the 30 bytes' header
         start += 30 + sum(struct.unpack("<HH", file.read(4))) + header

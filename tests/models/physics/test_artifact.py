@@ -92,6 +92,14 @@ def test_a_header_that_says_fewer_numbers_is_refused(file: Path, small: SensorDe
         load_artifact(file, small)
 
 
+def test_the_same_numbers_compressed_are_refused(file: Path, small: SensorDescription) -> None:
+    """They were taken for what they unpack to: the large array is used where it lies in the file."""
+    with np.load(file) as stored:
+        np.savez_compressed(file, **dict(stored))
+    with pytest.raises(ArtifactError, match="compressed"):
+        load_artifact(file, small)
+
+
 @pytest.mark.parametrize("name", ["triangles", "points", "jacobian", "greens"])
 def test_other_numbers_than_were_built_are_told_and_built_anew(
     built: Artifact, small: SensorDescription, name: str
