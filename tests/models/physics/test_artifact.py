@@ -93,7 +93,7 @@ def test_a_header_that_says_fewer_numbers_is_refused(file: Path, small: SensorDe
 
 
 def test_the_same_numbers_compressed_are_refused(file: Path, small: SensorDescription) -> None:
-    """They were taken for what they unpack to: the large array is used where it lies in the file."""
+    """The large array is used where it lies in the file: there it would be other numbers."""
     with np.load(file) as stored:
         np.savez_compressed(file, **dict(stored))
     with pytest.raises(ArtifactError, match="compressed"):
