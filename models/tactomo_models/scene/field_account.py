@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtr
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
@@ -22,7 +23,7 @@ from tactomo_models.scene.drawing import Drawing
 from tactomo_models.scene.evidence import Likelihood
 from tactomo_models.scene.field_fit import FieldFit, FittedField, Measured
 from tactomo_models.scene.parameters import E1, E2, EDGE, HOLE, PEAK, SIZE, UNIT_M, X, Y
-from tactomo_models.scene.pressure import FieldContacts
+from tactomo_models.scene.pressure import ONE_SIDED_95, FieldContacts
 from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import GradedResponse, SaturatingResponse
 
@@ -243,7 +244,11 @@ class FieldAccountant:
             of_peaks = family.unit_kpa * np.array([0.0, *(one.sigmas[PEAK] for one in likely)])
             slopes = np.array([one.slope for one in alone])
             # Whatever else it may be has a peak of its own uncertainty.
+            own_sigmas = np.hypot(contacts.peak_magnitude_sigma[at], slopes * of_peaks)
             more = float(share @ (slopes * of_peaks) ** 2)
+            peaks = np.array([one.peak_magnitude for one in alone])
+            sides = contacts.peak_magnitude_sides.copy()
+            sides[:, at] = _sides(share, peaks, own_sigmas)
             evenest = min(
                 zip((contact, *(one.contact for one in likely)), alone, strict=True),
                 key=lambda one: one[0][EDGE],
@@ -256,6 +261,7 @@ class FieldAccountant:
                 peak_magnitude_sigma=wider(
                     contacts.peak_magnitude_sigma, lambda one: one.peak_magnitude, more
                 ),
+                peak_magnitude_sides=sides,
                 felt=felt,
                 peak_kpa=moved(contacts.peak_kpa, lambda one: one.peak_kpa),
                 mean_kpa=moved(contacts.mean_kpa, lambda one: one.mean_kpa),
@@ -396,9 +402,11 @@ class FieldAccountant:
         by_outline_kpa = by_outline * peak_size / np.maximum(peak_slope, 1e-12)
         # What magnitude and area undo of it is the pressure beyond the table's onset alone.
         by_edge = np.abs(by_outline - by_outline_kpa / peaks)
+        peak_sigma = np.hypot(peak_slope * sigma(by_peak), by_outline * peak_size)
         known["contacts"] = FieldContacts(
             peak_magnitude=peak_size,
-            peak_magnitude_sigma=np.hypot(peak_slope * sigma(by_peak), by_outline * peak_size),
+            peak_magnitude_sigma=peak_sigma,
+            peak_magnitude_sides=np.stack([peak_sigma, peak_sigma]),
             felt=peak_size,
             felt_sigma=peak_slope * sigma(by_peak),
             peak_kpa=peaks,
@@ -463,6 +471,21 @@ class FieldAccountant:
             UNIT_M * each[:, X] - highest_m[0][:, None], UNIT_M * each[:, Y] - highest_m[1][:, None]
         )
         return np.asarray((apart / np.exp(each[:, SIZE])).argmin(axis=1))
+
+
+def _sides(share: FloatArray, means: FloatArray, sigmas: FloatArray) -> FloatArray:
+    """How far (2,) below and above the mean of normal distributions the bounds of 95 % are.
+
+    In `ONE_SIDED_95`; shares, means and standard deviations are of each distribution, (n,).
+    """
+    below, above = (means - 6 * sigmas).min(), (means + 6 * sigmas).max()
+    least, most = np.full((2, 2), [[below], [above]])
+    for _ in range(50):  # bisection of both
+        middle = (least + most) / 2
+        is_less = ndtr((middle[:, None] - means) / np.maximum(sigmas, 1e-12)) @ share < (0.05, 0.95)
+        least, most = np.where(is_less, middle, least), np.where(is_less, most, middle)
+    bounds, mean = (least + most) / 2, share @ means
+    return np.asarray(np.maximum([mean - bounds[0], bounds[1] - mean], 0.0) / ONE_SIDED_95)
 
 
 @dataclass(frozen=True)

@@ -58,6 +58,9 @@ class FieldContacts:
 
     peak_magnitude: FloatArray  # (K,) |relative conductivity change| under the highest pressure
     peak_magnitude_sigma: FloatArray  # (K,) standard uncertainties
+    # (2, K) the same downwards and upwards: `ONE_SIDED_95` times as far are the bounds of 95 %,
+    # where the accounts that are likely have peaks of their own
+    peak_magnitude_sides: FloatArray
     # (K,) the same by the likely account in which the pressure falls least towards the edge: it
     # tells best whether anything is felt at all
     felt: FloatArray
@@ -203,11 +206,13 @@ def pressures_of(
         unknown = (PressureRange.UNKNOWN,) * len(magnitude)
         return Pressures(nothing, nothing, nothing, nothing, unknown, nothing, nothing, nothing)
     highest, highest_sigma = felt, felt_sigma = magnitude, magnitude_sigma
+    down, up = highest_sigma, highest_sigma
     if field is not None:
         highest, highest_sigma = field.peak_magnitude, field.peak_magnitude_sigma
+        down, up = field.peak_magnitude_sides
         felt, felt_sigma = field.felt, field.felt_sigma
     lasts = [PressureRange.UNKNOWN] * len(magnitude) if last is None else last
-    columns = (felt, felt_sigma, highest, highest_sigma)
+    columns = (felt, felt_sigma, highest, up)
     ranges = tuple(
         curve.range_of(size, error, was, highest=(peak_size, peak_error))
         for (size, error, peak_size, peak_error), was in zip(
@@ -219,7 +224,7 @@ def pressures_of(
     peak = curve.pressure(highest)
     spread, own = curve.spread(highest, highest_sigma), curve.sigma(highest)
     peak_sigma = np.hypot(spread, own)
-    least = mean_least = curve.least(highest, highest_sigma)
+    least = mean_least = curve.least(highest, down)
     if field is not None:
         # The curve in force may be another than the description's table, as after a calibration.
         by_curve = peak / np.maximum(field.peak_kpa, 1e-12)
@@ -250,5 +255,5 @@ def pressures_of(
         ranges=ranges,
         peak_kpa=told(peak, least),
         peak_sigma_kpa=told(peak_sigma, nothing),
-        max_kpa=np.where(above, np.inf, curve.bound(highest, highest_sigma)),
+        max_kpa=np.where(above, np.inf, curve.bound(highest, up)),
     )

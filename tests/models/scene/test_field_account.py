@@ -29,6 +29,7 @@ from tactomo_models.scene.parameters import (
     PRIOR_SIGMA,
     SIZE,
 )
+from tactomo_models.scene.pressure import ONE_SIDED_95
 
 RADIUS_M = 0.012
 AREA_M2 = np.pi * RADIUS_M**2
@@ -295,6 +296,30 @@ def test_another_account_that_is_as_likely_is_half_of_what_is_shown(sensor: Sens
         # Numbers of one are summed over the map's samples, of the other over the mesh.
         assert shown == pytest.approx((a + b) / 2, rel=0.05)
         assert sigma == pytest.approx(np.hypot(said, abs(b - a) / 2), rel=0.3)
+
+
+@pytest.mark.parametrize("odds", [0.25, 4.0])
+def test_bounds_of_a_peak_are_those_of_all_that_it_may_be(sensor: Sensor, odds: float) -> None:
+    """A normal distribution's bound is lower than both peaks, or does not know of the rarer."""
+    field, data = explained(sensor, KINDS["flat"])
+    different = other_of(KINDS["flat"], peak=0.2, edge=0.5)
+    accounts = accountant(sensor)
+    own = accounts.account(field, data).contacts
+    apart = accounts.account(explained(sensor, different)[0], data).contacts
+    alternative = Alternative(odds, different, np.zeros(COLUMNS))
+    both = accounts.account(field, data, [[alternative]]).contacts
+    assert own is not None
+    assert apart is not None
+    assert both is not None
+    rng = np.random.default_rng(0)
+    is_other = rng.random(100_000) < odds / (1 + odds)
+    sigma = own.peak_magnitude_sigma[0]
+    peaks = np.where(is_other, apart.peak_magnitude[0], own.peak_magnitude[0])
+    bounds = np.quantile(peaks + sigma * rng.standard_normal(len(peaks)), (0.05, 0.95))
+    told = (
+        both.peak_magnitude[0] + ONE_SIDED_95 * np.array([-1, 1]) * both.peak_magnitude_sides[:, 0]
+    )
+    assert told == pytest.approx(bounds, abs=0.2 * sigma)
 
 
 def test_the_pressure_under_an_even_contact_is_even_where_a_ring_is_as_likely(
