@@ -932,6 +932,23 @@ def test_a_move_is_over_with_its_own_frame_whichever_comes_first(page: Page) -> 
     assert is_before == [True, True, False]
 
 
+def test_a_replay_that_goes_on_is_not_stale_before_its_next_frame(page: Page) -> None:
+    page.open()
+    found = page.browser.execute_async_script("""
+        const done = arguments[0];
+        import('/health.js').then(({ verdict }) => {
+          const now = 1e6, at = { receivedAt: now };
+          const state = {
+            link: { isOpen: true },
+            hello: { status_stale_ms: 5000, frame_stale_ms: 500 },
+            status: { age_ms: 0, ...at, fields: { state: 'running', replay: { paused: false } } },
+            frame: { age_ms: 26_000, ...at },
+          };
+          done([100, 2000].map((ms) => verdict({ ...state, stoodAt: now - ms }, now)?.name));
+        })""")
+    assert found == [None, "stale"]
+
+
 def test_a_replay_that_waits_for_the_page_begins_when_its_first_frame_is_seen(page: Page) -> None:
     page.daemon.answers["replay"] = REPLAY
     waiting = REPLAY | {"paused": True, "waits_for_page": True}

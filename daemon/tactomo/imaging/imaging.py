@@ -234,6 +234,10 @@ class Imaging:
         """The newest map's number."""
         return int(self._publisher.envelope(MAP)["sequence"])
 
+    def tell_status(self) -> None:
+        """Have the status published now."""
+        self._publisher.tell_status()
+
     def forget(self) -> None:
         """Take the next dual scan for the first one: it does not follow on those before."""
         self._reconstructor.reset()

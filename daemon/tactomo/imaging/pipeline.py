@@ -210,8 +210,9 @@ class Pipeline(Worker):
             if self._replay_clock is not None and self._replay_clock.has_ended and not self._ready:
                 if self._replay is not None and self._replay.playback.loops:
                     self._move(0.0)
-                else:
+                elif not self.finished.is_set():
                     self.finished.set()
+                    self._imaging.tell_status()
 
     @property
     def _takes_all(self) -> bool:

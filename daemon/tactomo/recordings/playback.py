@@ -18,13 +18,17 @@ MAX_LAG_S: Final = 0.25
 class Playback:
     """Where a replay is, for any thread; speed 0 is as fast as it is taken."""
 
-    def __init__(self, start_ns: int, end_ns: int, speed: float) -> None:
+    def __init__(
+        self, start_ns: int, end_ns: int, speed: float, last_ns: int | None = None
+    ) -> None:
         self.passes = 0  # how often it was moved
         self.maps_before = 0  # how many maps were published before this pass
         self.start_ns = self.begin_ns = start_ns  # of the recording; of this pass
         self.loops = False  # whether the end is followed by the beginning
         self.waits_for_page = False  # whether it is paused until somebody looks
+        self.steered_ns = time.monotonic_ns()  # when somebody last steered it
         self._end_ns = end_ns
+        self._last_ns = end_ns if last_ns is None else last_ns  # from where something still comes
         self._speed = speed
         self._is_paused = False
         self._is_stepping = False
@@ -93,6 +97,7 @@ class Playback:
                 self._is_paused, self._is_stepping, self.waits_for_page = paused, False, False
             self._speed = self._speed if speed is None else speed
             self.loops = self.loops if loop is None else loop
+            self.steered_ns = time.monotonic_ns()
             self._changed.notify_all()
 
     def step(self) -> None:
@@ -116,7 +121,7 @@ class Playback:
         """Go on `position_s` seconds after the beginning; while paused, by one dual scan."""
         with self._changed:
             position_ns = self.start_ns + round(position_s * 1e9)
-            self.begin_ns = self._position_ns = min(position_ns, self._end_ns)
+            self.begin_ns = self._position_ns = min(position_ns, self._last_ns)
             self._since_ns = None
             self._is_stepping = self._is_paused
             self.passes += 1

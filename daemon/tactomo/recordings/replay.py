@@ -128,7 +128,7 @@ def read_replay(urls: Sequence[str], description: SensorDescription) -> Replay |
         marks=marks,
         reference=reference,
         is_paced=speed > 0,
-        playback=Playback(recording.start_ns, recording.end_ns, speed),
+        playback=Playback(recording.start_ns, recording.end_ns, speed, _last_ns(marks)),
         calibration=calibration,
         knows_calibration=calibration is not None or had_none,
     )
@@ -160,6 +160,12 @@ def parse_replay_url(url: str) -> tuple[Recording, int, float]:
 def without_calibrations(marks: Sequence[Mark]) -> list[Mark]:
     """Return marks that leave the pressure calibration as it is."""
     return [replace(mark, calibration=None) for mark in marks]
+
+
+def _last_ns(marks: Sequence[Mark]) -> int | None:
+    """Return from when on the bytes of the last dual scan came: after those of the one before."""
+    before = [mark.clock_ns for mark in marks if mark.clock_ns < marks[-1].clock_ns]
+    return max(before) + 1 if before else None
 
 
 def _check_reference(

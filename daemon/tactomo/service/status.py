@@ -129,6 +129,8 @@ class Status:
             return "waiting_for_port" if is_waiting else "waiting_for_data"
         stale_s = max(STALE_S, self._imaging.frame_rate.pace.few_s)
         now_ns = time.monotonic_ns()
+        if self._playback is not None:
+            last_ns = max(last_ns, self._playback.steered_ns)
         if now_ns - last_ns > stale_s * 1e9:
             return "stale" if now_ns - self._pipeline.delivered_ns > stale_s * 1e9 else "late"
         return "taring" if self._imaging.taring.is_on else "running"

@@ -86,6 +86,7 @@ def test_it_says_when_data_are_stale() -> None:
     with FakeSensor("left") as fake, old_frames(fake):
         shown, _ = in_a_terminal(until="STALE")
     assert "STALE: the newest frame is" in shown
+    assert "nothing pressed" not in shown
 
 
 def test_the_end_of_a_replay_is_not_called_stale() -> None:
@@ -146,6 +147,14 @@ def test_it_says_how_well_a_pressure_is_known(fields: dict[str, Any], words: str
         fake.wait_for_subscriber()
         fake.publish([dataclasses.replace(CONTACT, **fields)])
         assert frame_line(next(frames)).endswith(f"mm {words}")
+
+
+def test_no_contacts_mean_nothing_pressed_only_where_touches_are_seen() -> None:
+    with FakeSensor("skin") as fake, subscribe("skin", address=fake.address) as frames:
+        fake.wait_for_subscriber()
+        for flags, words in (([], "nothing pressed"), (["no_reference"], "not known  [no_ref")):
+            fake.publish([], flags=flags)
+            assert words in frame_line(next(frames))
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ from tactomo.recordings.recording import Origin
 from tactomo.recordings.recording_set import open_replayable
 from tactomo.recordings.recording_writer import RecordingWriter
 from tactomo.service.daemon import Daemon
+from tactomo.service.status import STALE_S
 from tactomo_client import ControlError
 from tactomo_client.messages import array_from_wire
 from tactomo_models import load_description
@@ -246,6 +248,28 @@ def test_a_step_gives_one_frame_of_a_read_that_brought_several(play: Any, tmp_pa
         assert counters(b) == list(range(1, count + 1))
         assert count == 12 or b.ask("status")["state"] == "paused"
     b.until(lambda: b.ask("status")["state"] == "ended")
+
+
+def test_the_end_of_a_paused_replay_shows_its_last_frame(play: Any, life: Life) -> None:
+    b = play(life.path)
+    b.ask("replay", position_s=1e9)
+    b.until(lambda: counters(b) == [max(life.values)])
+
+
+def test_a_replay_that_goes_on_is_not_stale_before_its_next_frame(play: Any, life: Life) -> None:
+    b = play(life.path)
+    b.ask("replay", step=True)
+    b.until(lambda: len(counters(b)) == 1)
+    time.sleep(STALE_S + 0.1)
+    b.ask("replay", paused=False, speed=0.01)
+    assert b.ask("status")["state"] == "running"
+
+
+def test_the_end_is_told_at_once(play: Any, life: Life, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tactomo.stream.publisher.STATUS_PERIOD_S", 1000.0)
+    b = play(life.path, speed=5)
+    b.ask("replay", paused=False)
+    b.listener.wait("status", lambda status: status["state"] == "ended")
 
 
 def test_the_reply_to_a_move_tells_which_maps_are_of_before(play: Any, life: Life) -> None:

@@ -30,7 +30,7 @@ export function isMapCurrent(found) {
 /**
  * The banner as {name, level, title, detail}, or null when all is well. What hides everything else
  * comes first. What is under way is an info. `state` has hello, link, frame, status, openedAt,
- * isMoving.
+ * isMoving, stoodAt.
  */
 export function verdict(state, now) {
   const { link, frame, status, hello } = state;
@@ -71,7 +71,7 @@ export function verdict(state, now) {
   if (fields.replay?.paused) {
     return banner("replay-paused", "info", "The replay is paused.", "The map shows the frame at the slider.");
   }
-  const age = ageOf(frame, now);
+  const age = Math.min(ageOf(frame, now), now - state.stoodAt);
   if (age > staleAfter(fields, hello)) {
     const since = frame ? `The newest scan is ${seconds(age)} old. ` : "";
     return banner("stale", "error", "Stale.", since + wrong);

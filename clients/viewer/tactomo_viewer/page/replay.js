@@ -8,6 +8,7 @@ export class Replay {
   constructor(command) {
     this.command = command;
     this.fields = null;
+    this.stoodAt = -Infinity;  // until when no frame was to come
     this.moves = null;  // where it is to go on, until that is answered
     byId("play").onclick = () => this.#ask(
       this.#hasEnded ? { position_s: 0, paused: false } : { paused: !this.fields.paused });
@@ -45,7 +46,9 @@ export class Replay {
   tick(now) {
     const { fields } = this;
     if (!fields) return;
-    const since = fields.paused || this.#hasEnded ? 0 : ((now - this.shownAt) / 1000) * fields.speed;
+    const stands = fields.paused || this.#hasEnded;
+    if (stands) this.stoodAt = now;
+    const since = stands ? 0 : ((now - this.shownAt) / 1000) * fields.speed;
     const position = Math.min(fields.position_s + since, fields.duration_s);
     const slider = byId("position");
     if (!slider.matches(":active") && this.moves === null) slider.value = position;

@@ -26,6 +26,7 @@ const state = {
   painted: [],              // {at, latency} of the last frames, ms
   fitted: { kpa: 0, percent: 0 },
   awaited: null,            // the press whose picture is awaited
+  get stoodAt() { return replay.stoodAt; },
   get isMoving() { return replay.isBefore(state.frame); },
 };
 

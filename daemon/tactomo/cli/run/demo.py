@@ -212,12 +212,15 @@ def _print_addresses(addresses: Mapping[str, Any]) -> None:
     tactomo = shlex.quote(f"{folder}tactomo")
     at = "" if len(running("daemon")) == 1 else f" --address {stream}"
     at_twin = "" if len(running("twin")) == 1 else f" --address {addresses.get('twin')}"
-    press = ", and press the skin there by mouse" if "twin" in addresses else ""
-    say(f"{name} is running; Ctrl-C stops everything. Open{press}:\n")
+    is_replay = "twin" not in addresses
+    what = "replayed" if is_replay else "running"
+    press = "" if is_replay else ", and press the skin there by mouse"
+    say(f"{name} is {what}; Ctrl-C stops everything. Open{press}:\n")
     say(f"    {addresses['viewer']}\n\nOr in another terminal:\n")
-    if "twin" in addresses:
+    if not is_replay:
         say(f"    {tactomo} poke press x_mm=10 y_mm=-20{at_twin}")
-    for command in ("watch", "status", "tare", "record press.mcap --seconds 10"):
+    live = () if is_replay else ("tare", "record press.mcap --seconds 10")
+    for command in ("watch", "status", *live):
         say(f"    {tactomo} {command}{at}")
     where = "" if stream == options.DEFAULT_STREAM else f', address="{stream}"'
     say(f"\nOr in {f'{folder}python' if folder else 'Python'}:\n")

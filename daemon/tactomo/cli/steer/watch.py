@@ -142,7 +142,14 @@ def frame_line(frame: Frame) -> str:
         for c in frame.contacts
     )
     flags = f"  [{', '.join(sorted(frame.flags))}]" if frame.flags else ""
-    return f"{frame.scan_counter:8d}  {frame.tier or '-':<9} {pressed or 'nothing pressed'}{flags}"
+    pressed = pressed or _without_contacts(frame)
+    return f"{frame.scan_counter:8d}  {frame.tier or '-':<9} {pressed}{flags}"
+
+
+def _without_contacts(frame: Frame) -> str:
+    from tactomo_client.schema import TOUCHES_SEEN
+
+    return "nothing pressed" if frame.flags <= TOUCHES_SEEN else "not known"
 
 
 def _screen(view: View, columns: int, rows: int) -> RenderableType:
@@ -157,7 +164,7 @@ def _screen(view: View, columns: int, rows: int) -> RenderableType:
     description = view.status.fields.get("description") or {} if view.status else {}
     image = map_text(frame, description, max(10, min(columns - 44, 2 * (rows - 6))))
     body = Table.grid(padding=(0, 2))
-    body.add_row(image, Group(_contact_table(frame), Text(), _health(view, frame)))
+    body.add_row(image, Group(_contact_table(frame, view.is_stale), Text(), _health(view, frame)))
     panel = Panel(
         body,
         title=Text(f"tactomo watch {view.sensor}"),
@@ -214,13 +221,13 @@ def map_text(frame: Frame, description: Mapping[str, Any], columns: int) -> Text
     return text
 
 
-def _contact_table(frame: Frame) -> RenderableType:
+def _contact_table(frame: Frame, is_stale: bool) -> RenderableType:
     from rich.table import Table
     from rich.text import Text
     from tactomo_client.appearance import force_words, pressure_words
 
     if not frame.contacts:
-        return Text("nothing pressed", "dim")
+        return Text("not known" if is_stale else _without_contacts(frame), "dim")
     table = Table(box=None, pad_edge=False)
     for name in ("#", "x mm", "y mm", "mm²", "pressure", "force"):
         table.add_column(name, justify="right")
