@@ -11,7 +11,8 @@ ModelError
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -40,6 +41,15 @@ class DataError(ModelError):
 
 class MethodError(ModelError):
     """A reconstruction method that there is not, or that the sensor cannot do."""
+
+
+@contextmanager
+def os_errors_as(kind: type[ModelError], what: str, next_step: str) -> Iterator[None]:
+    """Raise an OSError as one of these; `what` failed, such as "cannot write FILE"."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{what}: {error.strerror}; {next_step}") from error
 
 
 def explain_all(items: Iterable["ErrorDetails"]) -> list[str]:

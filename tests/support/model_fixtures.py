@@ -95,11 +95,11 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def solves(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Counts forward solves."""
     counted: list[int] = []
-    solve = CompiledSheet.solve
+    solve = CompiledSheet._solve
 
     def counting(self: CompiledSheet, *arguments: object, **options: object) -> object:
         counted.append(1)
         return solve(self, *arguments, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(CompiledSheet, "solve", counting)
+    monkeypatch.setattr(CompiledSheet, "_solve", counting)
     return counted

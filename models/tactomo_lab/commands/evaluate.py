@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
     from rich.text import Text
     from tactomo.cli.console import Console
 
-    from tactomo_lab.evaluation.stability import Judged, Trust
+    from tactomo_lab.evaluation.stability import Trust
     from tactomo_lab.scenes.measures import Score, Summary
 
 MAPS = ("frames", "ICC", "worst", "shape", "RIE", "flagged", "wrong", "ms", "p99")
@@ -55,7 +54,6 @@ DAYS = (
 )
 FEWER = 10  # frames without tracking are slow, for all that they show
 NAME_WIDTH, CELL_WIDTH = 17, 16  # characters of the first and of the other columns of regimes
-IN_WORDS = "auto"  # the method whose doings are told in words, where it is among those asked for
 
 SnrOf = Annotated[
     Literal["change", "voltage"],
@@ -441,25 +439,21 @@ def stability(
     def show(console: Console) -> None:
         what = f"{description.name}, {seeds} seeds, {count} case(s) of each regime"
         console.print(f"Simulated, not measured: {what}.")
-        _print_regimes(console, by_regime, scores)
+        _print_regimes(console, by_regime)
 
     tell(told, as_json, show, picture, partial(draw_overview, by_regime))
 
 
-def _print_regimes(
-    console: Console, rows: dict[str, dict[str, Trust]], scores: Sequence[Judged]
-) -> None:
+def _print_regimes(console: Console, rows: dict[str, dict[str, Trust]]) -> None:
     fit = max(1, (console.width - NAME_WIDTH) // CELL_WIDTH)
     methods = list(rows["all"])
     for first in range(0, len(methods), fit):  # as many tables as the terminal is too narrow for
         console.print(_counts(rows, methods[first : first + fit]))
     console.print(
         "Each cell: mean ICC; bad maps (ICC < 0.7) without a flag that tells to distrust, of "
-        "all bad ones; good maps with one, of all good ones.\n",
+        "all bad ones; good maps with one, of all good ones. --json tells what every method did.",
         style="dim",
     )
-    method = IN_WORDS if IN_WORDS in methods else methods[0]
-    console.print(_doings(method, [one for one in scores if one.method == method]))
 
 
 def _counts(rows: dict[str, dict[str, Trust]], methods: Sequence[str]) -> Table:
@@ -479,21 +473,3 @@ def _trust(counts: Trust) -> Text:
     silent = Text(f"{counts.bad_unwarned}/{counts.bad}", "red" if counts.bad_unwarned else "")
     good = f" {counts.good_warned}/{counts.maps - counts.bad}"
     return Text(f"{counts.icc:.2f} ").append_text(silent).append(good)
-
-
-def _doings(method: str, scores: Sequence[Judged]) -> Table:
-    """What one method did in each regime: tiers that made the maps, and flags."""
-    from tactomo_lab.evaluation.regimes import REGIMES
-
-    columns = ("", "what goes wrong", "made by", "flags")
-    made = table(*columns, left=columns, title=f"what {method} did")
-    for regime in dict.fromkeys(one.regime for one in scores):
-        own = [one for one in scores if one.regime == regime]
-        tiers = Counter(one.score.tier for one in own)
-        flags = Counter(flag for one in own for flag in one.score.flags)
-        made.add_row(regime, REGIMES[regime].what, _tally(tiers), _tally(flags))
-    return made
-
-
-def _tally(counts: Counter[str]) -> str:
-    return ", ".join(f"{name} {count}" for name, count in counts.most_common()) or "none"

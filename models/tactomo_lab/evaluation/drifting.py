@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Annotated, Final
 
 import numpy as np
 from tactomo_models.arrays import FloatArray
@@ -24,6 +24,7 @@ from tactomo_protocol import Channel
 from tactomo_lab.evaluation.play import Player, Variant
 from tactomo_lab.scenes.case import REFERENCE_SCANS, Case, Frame, as_described
 from tactomo_lab.scenes.drawing import SeedSet, require_channels, seed_of
+from tactomo_lab.scenes.measures import Figure
 from tactomo_lab.scenes.simulation import IMPEDANCE_DEVIATION, UNEVENNESS, Volts
 
 DRIFT: Final = SkinDrift(swing_k=10.0, creep=0.01, impedance=0.1)
@@ -207,16 +208,22 @@ def live(day: Day, *, track: bool = True, every: int = 1) -> Iterator[Seen]:
 class DaySummary:
     """What became of a day."""
 
-    frames: int  # how many
-    ghost_share: float  # of frames, that show a contact where nothing presses
-    ghosts_per_hour: float  # times that such a contact begins, an hour
-    presses: int  # how many
-    missed: int  # presses that were never shown
-    erased: int  # presses that were shown, and vanished while they lasted
-    erased_share: float  # of frames under a press, that do not show it
-    distrusted: float  # share of frames that say that they are not to be trusted
-    refused: float  # share of frames at which the tracker refused
-    magnitude_error: float  # mean relative error of firm presses' magnitudes
+    frames: Annotated[int, Figure("frames", "d")]
+    ghost_share: Annotated[float, Figure("ghosts", ".1%", "frames with one")]
+    ghosts_per_hour: Annotated[
+        float, Figure("ghosts/h", ".2f", "contacts that begin where nothing presses")
+    ]
+    presses: Annotated[int, Figure("presses", "d")]
+    missed: Annotated[int, Figure("unseen", "d", "presses that are never shown")]
+    erased: Annotated[int, Figure("erased", "d", "presses that vanish for a while")]
+    erased_share: Annotated[
+        float, Figure("hidden", ".1%", "frames under a press that do not show it")
+    ]
+    distrusted: Annotated[
+        float, Figure("distrusted", ".1%", "frames with a flag that tells to distrust")
+    ]
+    refused: Annotated[float, Figure("refused", ".1%", "frames not followed")]
+    magnitude_error: Annotated[float, Figure("firm Δσ", ".1%", "error of firm presses' magnitude")]
 
 
 def summarise_day(seen: Sequence[Seen], hours: float) -> DaySummary:

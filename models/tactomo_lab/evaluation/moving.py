@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from itertools import chain, combinations
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from tactomo_models.arrays import FloatArray
@@ -55,7 +55,7 @@ from tactomo_lab.scenes.drawing import (
     is_inside,
     seed_of,
 )
-from tactomo_lab.scenes.measures import WRONG_ICC, Score, Summary, percentile, summarise
+from tactomo_lab.scenes.measures import WRONG_ICC, Figure, Score, Summary, percentile, summarise
 
 Presses = Mapping[str, Press]
 NoiseOf = Literal["each change", "voltage"]
@@ -443,10 +443,14 @@ def _course(draw: Draw, lane: Lane, frames: int) -> list[Press]:
 class PhaseSummary(Summary):
     """One phase over many sequences."""
 
-    # longest run of frames in which the shape's ICC is below `WRONG_ICC`; median over the sequences
-    recovery: float
-    recovery_most: float  # of the slowest sequence
-    switches: int  # identities lost, in all
+    recovery: Annotated[
+        float,
+        Figure(
+            "lost", ".0f", "longest run of frames in which the shape's ICC is below 0.8, median"
+        ),
+    ]
+    recovery_most: Annotated[float, Figure("most", ".0f", "... of the slowest sequence")]
+    switches: Annotated[int, Figure("ids", "d", "identities lost")]
 
 
 def summarise_phases(sequences: Iterable[Iterable[Score]]) -> dict[str, PhaseSummary]:

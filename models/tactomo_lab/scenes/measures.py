@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -343,56 +343,86 @@ def full_range(description: SensorDescription) -> float:
     return float(np.abs(description.magnitude.response.change(np.array(FULL_RANGE_KPA))))
 
 
+class Figure(NamedTuple):
+    """A measure's column in tables."""
+
+    heading: str
+    form: str  # that it is printed in
+    meaning: str = ""  # where the heading does not say it
+    unit: float = 1.0  # in which it is printed, over the attribute's
+
+
 @dataclass(frozen=True)
 class Summary:
-    """Many frames' measures. Means, where nothing else is said; NaN where nothing was measured."""
+    """Many frames' measures. Means, where nothing else is said; NaN where nothing was measured.
 
-    frames: int  #: how many, of a scene each where scenes are still
-    #: icc, rie: of the magnitude map
-    icc: float
-    icc_worst: float  #: of the worst scene in twenty (5th percentile)
-    rie: float
-    icc_structure: float  #: of the pressed shape
-    count_right: float  #: share of scenes with the right number of contacts
-    missed: float  #: share of the true contacts
-    false: float  #: contacts that are none, a scene
-    #: centre_mm, centre_mm_95: median and 95th percentile, matched contacts
-    centre_mm: float
-    centre_mm_95: float
-    area_error: float  #: median of the relative error's size
-    magnitude_error: float  #: size of the error as a share of the range
-    #: largest minus smallest error at one pressure (bands of `BAND_KPA`), a share of the range: the
-    #: paper's measure
-    magnitude_spread: float
-    pressure_error_kpa: float  #: size of the error where a pressure was reported
-    #: share of magnitude errors within one reported standard uncertainty; 0.68 where those are
-    #: right
-    within_sigma: float
-    #: place_within_sigma, area_within_sigma, peak_within_sigma: likewise of x and y, ...
-    place_within_sigma: float
-    area_within_sigma: float
-    peak_within_sigma: float
-    #: share of the true contacts whose peak pressure is right (`ContactScore.peak_right`), of those
-    #: that the magnitude channel answers to
-    peak_right: float
-    #: share of the peaks told with an uncertainty, or as above the range, that are surely wrong;
-    #: see `ContactScore.surely_wrong`
-    peak_surely_wrong: float
-    #: overload_right, overload_wrong: shares of the true contacts beyond the response table's end:
-    #: reported without a bound, and denied by a 95 % interval; NaN where none is beyond
-    overload_right: float
-    overload_wrong: float
-    #: force_error, force_error_several: mean size of the relative error of all force, where one
-    #: contact presses and where several do
-    force_error: float
-    force_error_several: float
-    distrusted: float  #: share of scenes flagged as not to be trusted
-    bad_unflagged: float  #: share of scenes with an ICC below `BAD_ICC` and not flagged so
-    good_flagged: float  #: share of the other scenes that are flagged so
-    confidently_wrong: float  #: share of scenes that are wrong and not flagged
-    #: seconds, seconds_99: median and 99th percentile of the compute time
-    seconds: float
-    seconds_99: float
+    Shares of contacts are of the true ones; errors of the magnitude are shares of the range.
+    """
+
+    frames: Annotated[int, Figure("frames", "d")]  #: of a scene one each where scenes are still
+    icc: Annotated[float, Figure("ICC", ".3f")]  #: of the magnitude map, as the RIE
+    icc_worst: Annotated[float, Figure("worst", ".2f", "ICC that 95 % exceed")]
+    rie: Annotated[float, Figure("RIE", ".3f")]
+    icc_structure: Annotated[float, Figure("shape", ".3f", "ICC of the pressed shape")]
+    count_right: Annotated[float, Figure("counted", ".0%", "right")]
+    missed: Annotated[float, Figure("missed", ".0%", "of the true contacts")]
+    false: Annotated[float, Figure("false", ".2f", "a scene")]
+    centre_mm: Annotated[float, Figure("mm", ".2f", "centre error, median")]
+    centre_mm_95: Annotated[float, Figure("p95", ".1f")]  #: 95th percentile, matched contacts
+    area_error: Annotated[float, Figure("area", ".0%")]  #: median of the relative error's size
+    magnitude_error: Annotated[
+        float, Figure("Δσ", ".1%", "error of the magnitude, mean, share of the range")
+    ]
+    #: in bands of `BAND_KPA`: the paper's measure
+    magnitude_spread: Annotated[
+        float, Figure("spread", ".0%", "largest minus smallest at one pressure")
+    ]
+    pressure_error_kpa: Annotated[float, Figure("kPa", ".1f")]  #: its size, where one was reported
+    within_sigma: Annotated[
+        float,
+        Figure("in σ", ".0%", "within one reported standard uncertainty, 68 % where that is right"),
+    ]
+    place_within_sigma: Annotated[float, Figure("place in σ", ".0%")]  #: of x and y
+    area_within_sigma: Annotated[float, Figure("area in σ", ".0%")]
+    peak_within_sigma: Annotated[float, Figure("peak in σ", ".0%")]
+    #: `ContactScore.peak_right`, of those that the magnitude channel answers to
+    peak_right: Annotated[float, Figure("right to 10 %", ".0%", "peaks, of the true contacts")]
+    #: `ContactScore.surely_wrong`, of those told with an uncertainty or as above the range
+    peak_surely_wrong: Annotated[
+        float,
+        Figure(
+            "surely wrong",
+            ".0%",
+            "peaks 3 reported sigmas and 10 % off, or told above a range that they lie in",
+        ),
+    ]
+    overload_right: Annotated[
+        float,
+        Figure(
+            "overload right", ".0%", "of contacts beyond the response table, told without a bound"
+        ),
+    ]
+    overload_wrong: Annotated[
+        float,
+        Figure("overload wrong", ".0%", "likewise, those whose 95 % interval ends below them"),
+    ]
+    force_error: Annotated[
+        float, Figure("force", ".1%", "error of all force, mean, where one contact presses")
+    ]
+    force_error_several: Annotated[float, Figure("forces", ".1%", "the same where several press")]
+    distrusted: Annotated[float, Figure("flagged", ".0%")]  #: as not to be trusted
+    bad_unflagged: Annotated[
+        float,
+        Figure("silent", ".0%", "maps with an ICC below 0.7 and no flag that tells to distrust"),
+    ]
+    good_flagged: Annotated[
+        float, Figure("alarms", ".0%", "good maps with such a flag, of the good ones")
+    ]
+    confidently_wrong: Annotated[
+        float, Figure("wrong", ".0%", "ICC below 0.8 or another count, and no flag that says so")
+    ]
+    seconds: Annotated[float, Figure("ms", ".0f", unit=1e-3)]  #: of processor time, median
+    seconds_99: Annotated[float, Figure("p99", ".0f", unit=1e-3)]
 
 
 def summarise(scores: Sequence[Score]) -> Summary:

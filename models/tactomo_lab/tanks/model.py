@@ -22,7 +22,7 @@ import scipy.linalg
 import scipy.sparse as sp
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.bare_sheet import assemble_sheet, electrode_fields
-from tactomo_models.physics.mesh import mesh_sheet
+from tactomo_models.physics.mesh import hat_gradients, mesh_sheet
 from tactomo_models.sensor.description import SensorDescription
 
 # Noise of a reading's change: of the root mean square of all reference readings, and of its own.
@@ -53,11 +53,7 @@ class TankModel:
         self.triangles = mesh.t.T  # (T, 3) nodes of each triangle
         # (2, P) electrodes i <= j, whose transfer resistances are all there are
         self.pairs = np.array(np.triu_indices(description.electrode_count))
-        p = mesh.p[:, mesh.t]  # (2, 3, T)
-        edge = np.roll(p, -2, axis=1) - np.roll(p, -1, axis=1)  # opposite each corner
-        twice = edge[0, 1] * edge[1, 2] - edge[1, 1] * edge[0, 2]
-        self._area = np.abs(twice) / 2
-        slopes = np.stack([-edge[1], edge[0]]) / twice  # (2, 3, T) of each corner's hat function
+        slopes, self._area = hat_gradients(mesh.p[:, mesh.t])
         count, nodes = len(self.triangles), len(self.points)
         at = np.repeat(np.arange(count), 3), self.triangles.ravel()
         shape = count, nodes

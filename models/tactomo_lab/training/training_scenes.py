@@ -17,7 +17,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from concurrent.futures import BrokenExecutor
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tactomo_models.archive import read_arrays, write_arrays, write_whole
 from tactomo_models.arrays import FloatArray
-from tactomo_models.errors import DataError, ModelError
+from tactomo_models.errors import DataError, ModelError, os_errors_as
 from tactomo_models.physics.bare_sheet import scan_voltages, transfer_resistances, volts_per_unit
 from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
 from tactomo_models.scene.press import strongest
@@ -243,7 +243,7 @@ def simulate(
     try:
         with closing(Parallel(n_jobs=jobs, return_as="generator_unordered")(work)) as made:
             for first, arrays in made:
-                with writing(shard_path(folder, first)) as path:
+                with _writing(path := shard_path(folder, first)):
                     write_arrays(path, arrays)
                 yield sizes[first]
     except BrokenExecutor as error:
@@ -259,16 +259,11 @@ def shards_of(scenes: int) -> Iterator[tuple[int, int]]:
         yield first, min(SHARD, scenes - first)
 
 
-@contextmanager
-def writing(path: Path) -> Iterator[Path]:
+def _writing(path: Path) -> AbstractContextManager[None]:
     """Say what to do where a file of a set cannot be written."""
-    try:
-        yield path
-    except OSError as error:
-        raise ModelError(
-            f"cannot write {path}: {error.strerror}; free some space or choose another folder, "
-            "then run the same command again: it goes on where it stopped"
-        ) from error
+    again = "then run the same command again: it goes on where it stopped"
+    next_step = f"free some space or choose another folder, {again}"
+    return os_errors_as(ModelError, f"cannot write {path}", next_step)
 
 
 def _manifest(description: SensorDescription, seed: int, scenes: int) -> Manifest:
@@ -290,7 +285,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
                 "folder, or delete this one"
             )
     content = json.dumps(asdict(manifest), indent=2) + "\n"
-    with writing(path):
+    with _writing(path):
         write_whole(path, lambda file: file.write(content.encode()))
 
 

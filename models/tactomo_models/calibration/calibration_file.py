@@ -22,7 +22,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from tactomo_models.archive import write_whole
 from tactomo_models.calibration.curve import MAX_KPA, MAX_MAGNITUDE, Fit, Reading, fit_curve
-from tactomo_models.errors import CalibrationError, explain
+from tactomo_models.errors import CalibrationError, explain, os_errors_as
 from tactomo_models.foreign_file import MAX_TEXT_BYTES, read_regular
 from tactomo_models.scene.pressure import PressureCurve
 from tactomo_models.sensor.description import SensorDescription
@@ -198,12 +198,9 @@ def read_calibration(path: Path) -> PressureCalibration:
 
 def write_kept(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     """Write what a sensor keeps, as a whole; raise CalibrationError where that cannot be done."""
-    try:
+    next_step = "name a file that you may write"
+    with os_errors_as(CalibrationError, f"cannot write {path}", next_step):
         write_whole(path, write)
-    except OSError as error:
-        raise CalibrationError(
-            f"cannot write {path}: {error.strerror}; name a file that you may write"
-        ) from error
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.calibration.curve import APART, Direction, Reading, direction_at
-from tactomo_models.errors import CalibrationError
+from tactomo_models.errors import CalibrationError, os_errors_as
 from tactomo_models.foreign_file import read_regular
 
 MAX_BYTES: Final = 16 << 20  # an hour of lines at 1 kHz
@@ -99,13 +99,9 @@ def read_load_cell(
         pressure_kpa=pressure,
         clock=clock,
         times_s=times_s,
-        magnitude=table.numbers("magnitude") if "magnitude" in table.columns else table.unknown,
-        magnitude_sigma=table.numbers("magnitude_sigma", least=0.0)
-        if "magnitude_sigma" in table.columns
-        else np.zeros(len(pressure)),
-        contact_mm2=table.numbers("contact_mm2", least=0.0)
-        if "contact_mm2" in table.columns
-        else table.unknown,
+        magnitude=table.optional("magnitude"),
+        magnitude_sigma=np.nan_to_num(table.optional("magnitude_sigma", least=0.0)),
+        contact_mm2=table.optional("contact_mm2", least=0.0),
         indenter_mm2=table.unknown if indenter_mm2 is None else indenter_mm2,
         directions=table.directions(),
     )
@@ -145,21 +141,10 @@ def joined_readings(cell: LoadCell, seen: Seen) -> Joined:
         raise CalibrationError(
             "nothing was held still under a load for half a second; hold each press longer"
         )
-    readings: list[Reading] = []
-    contact_mm2: list[float] = []
-    indenter_mm2: list[float] = []
-    lines: list[int] = []
-    missed: list[str] = []
-    for piece in pieces:
-        found = _reading(cell, piece, seen)
-        if not isinstance(found, str):
-            readings.append(found[0])
-            contact_mm2.append(found[1])
-            indenter_mm2.append(float(cell.indenter_mm2[piece[0]]))
-            lines.append(int(cell.lines[piece[0]]))
-        else:
-            missed.append(f"line {cell.lines[piece[0]]}, {found}")
-    if len(missed) > len(readings):
+    found = [(piece[0], _reading(cell, piece, seen)) for piece in pieces]
+    read = [(first, *one) for first, one in found if not isinstance(one, str)]
+    missed = [f"line {cell.lines[first]}, {why}" for first, why in found if isinstance(why, str)]
+    if len(missed) > len(read):
         raise CalibrationError(
             f"{len(missed)} of {len(pieces)} presses are not in the recording as one still "
             f"contact, such as {missed[0]}; it runs from {seen.times_s.min():.1f} to "
@@ -167,8 +152,9 @@ def joined_readings(cell: LoadCell, seen: Seen) -> Joined:
             "shifts the load cell's"
         )
     notes = (f"{len(missed)} presses left out, such as {missed[0]}",) if missed else ()
-    readings = _of_one_area(readings, np.array(contact_mm2), np.array(indenter_mm2))
-    return Joined(tuple(readings), tuple(lines), notes)
+    firsts, readings, contact_mm2 = (list(each) for each in zip(*read, strict=True))
+    readings = _of_one_area(readings, np.array(contact_mm2), cell.indenter_mm2[firsts])
+    return Joined(tuple(readings), tuple(cell.lines[firsts].tolist()), notes)
 
 
 def _of_one_area(
@@ -246,6 +232,9 @@ class _Table:
                 raise self._bad(i, column, "is out of range")
         return values
 
+    def optional(self, column: str, least: float = -MAX_NUMBER) -> FloatArray:
+        return self.numbers(column, least) if column in self.columns else self.unknown
+
     def pressures_kpa(self, area_mm2: float | None) -> FloatArray:
         if "pressure_kpa" in self.columns:
             return np.maximum(self.numbers("pressure_kpa"), 0.0)
@@ -290,9 +279,8 @@ class _Table:
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """The numbers and texts of the file's lines that are neither empty nor comments."""
     try:
-        text = read_regular(path, MAX_BYTES).decode("utf-8-sig")
-    except OSError as error:
-        raise CalibrationError(f"cannot read {path}: {error.strerror}; give a CSV file") from error
+        with os_errors_as(CalibrationError, f"cannot read {path}", "give a CSV file"):
+            text = read_regular(path, MAX_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise CalibrationError(f"{path} is not text; give a CSV file in UTF-8") from error
     for number, line in enumerate(io.StringIO(text, newline=None), start=1):

@@ -1,4 +1,4 @@
-"""Where a press is, learnt on one skin from presses at known places.
+"""Where a press is and how hard, learnt on one skin from presses at known places.
 
 Voltages depend smoothly on where a skin is pressed. A Gaussian process learns that dependence, of
 two inputs and M outputs, from few presses; a new press is where its voltages are likely, by Bayes'
@@ -44,6 +44,8 @@ CORRECTION_RANK: Final = 100
 """Eigenvectors that tell its variance; the others would lower it by less than 1 %."""
 UNLIKE: Final = 1.5
 """Times the misfit of the least explained presses (99 %), beyond which none like it was taught."""
+MIN_SPREAD: Final = 0.02
+"""Standard deviation of the logarithms of loads, below which no line can be told."""
 
 
 class Located(NamedTuple):
@@ -269,3 +271,33 @@ class Correction:
         kernel = np.exp(-0.5 * _squared_distances(seen, self._seen) / self._scale)
         known = ((kernel @ self._factor) ** 2).sum(axis=1)
         return kernel @ self._weights, self._variance * (1.0 + self._noise - known)
+
+
+class ForceRegression:
+    """Tells forces on the skin whose presses, of known force, it was made of.
+
+    The physics' load, magnitude times area, grows with the force. On logarithms the dependence is a
+    straight line; what is left depends on the place, where a Gaussian process learns it. A cover
+    that takes part of the load, and a table of another sheet, are in the line.
+
+    Raises DataError where there are too few presses, or all are of one load.
+    """
+
+    def __init__(
+        self,
+        loads: FloatArray,  # (N,) magnitude times area of each contact, on any one scale
+        xy_mm: FloatArray,  # (N, 2) where each was
+        force_n: FloatArray,  # (N,) newtons
+    ) -> None:
+        seen, known = np.log(loads), np.log(force_n)
+        if len(seen) < MIN_PRESSES or seen.std() < MIN_SPREAD:
+            raise DataError(f"give {MIN_PRESSES} presses of known force, or more, of various ones")
+        self._line = np.polyfit(seen, known, 1)
+        rest = known - np.polyval(self._line, seen)
+        self._rest = Correction(xy_mm, rest[:, None])
+
+    def force(self, loads: FloatArray, xy_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Forces (T,) of loads (T,) at places (T, 2), and their standard uncertainties, newtons."""
+        rest, variance = self._rest.at(xy_mm)
+        force_n = np.exp(np.polyval(self._line, np.log(loads)) + rest[:, 0])
+        return force_n, force_n * np.sqrt(variance)

@@ -25,8 +25,7 @@ from tactomo_models.calibration.calibration_file import (
     reading,
     write_kept,
 )
-from tactomo_models.calibration.force_regression import ForceRegression
-from tactomo_models.calibration.press_regression import PressRegression
+from tactomo_models.calibration.press_regression import ForceRegression, PressRegression
 from tactomo_models.errors import CalibrationError, DataError
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.reference import Reference

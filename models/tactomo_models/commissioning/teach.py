@@ -21,8 +21,7 @@ from tactomo_models.archive import read_arrays
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.batch import read_scans
 from tactomo_models.calibration.calibration_file import Subject
-from tactomo_models.calibration.force_regression import ForceRegression
-from tactomo_models.calibration.press_regression import PressRegression
+from tactomo_models.calibration.press_regression import ForceRegression, PressRegression
 from tactomo_models.calibration.taught_skin import TaughtSkin, load_of, press_changes
 from tactomo_models.errors import CalibrationError, DataError
 from tactomo_models.reconstruct import Reconstructor

@@ -35,8 +35,7 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.drift.channel_baseline import ChannelBaseline, Drift
-from tactomo_models.drift.drift_model import DriftSubspace
-from tactomo_models.drift.press_memory import PressMemory
+from tactomo_models.drift.drift_model import DriftSubspace, PressMemory
 from tactomo_models.reconstruct import Reconstructor
 from tactomo_models.scans.companion_forces import CompanionReading
 from tactomo_models.scans.measurement import Measurement

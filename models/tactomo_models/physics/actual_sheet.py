@@ -33,7 +33,7 @@ from tactomo_models.physics.bare_sheet import (
     transfer_of,
 )
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
+from tactomo_models.physics.mesh import SheetMesh, hat_gradients, mesh_sheet
 from tactomo_models.sensor.description import SensorDescription
 
 MAX_NODES = 6000  # that can be pressed: 75 MB of Green's function a sheet; the paper's has 2,500
@@ -227,11 +227,8 @@ class SheetEstimator:
     def _by_modes(self, shape: _Shape, first: IntArray, second: IntArray) -> FloatArray:
         """Derivatives (pairs, modes) of transfer resistances by the modes of conductivity."""
         corners = shape.mesh.mesh.t
-        p = shape.mesh.mesh.p[:, corners]
-        edge = np.roll(p, -2, axis=1) - np.roll(p, -1, axis=1)  # opposite each corner
-        twice = edge[0, 1] * edge[1, 2] - edge[1, 1] * edge[0, 2]
-        hats = np.stack([-edge[1], edge[0]]) / twice  # (2, 3, T) their gradients
+        hats, area = hat_gradients(shape.mesh.mesh.p[:, corners])
         field = np.einsum("dct,cta->adt", hats, shape.fields[corners])  # (L - 1, 2, T)
-        weight = (shape.conductivity * self._modes)[:, corners].mean(axis=1) * (np.abs(twice) / 2)
+        weight = (shape.conductivity * self._modes)[:, corners].mean(axis=1) * area
         products = (field[first] * field[second]).sum(axis=1)
         return np.asarray(-products @ weight.T)

@@ -19,7 +19,7 @@ from platformdirs import user_cache_path
 
 from tactomo_models.archive import map_array, read_arrays, write_whole
 from tactomo_models.arrays import FloatArray
-from tactomo_models.errors import ArtifactError, DataError
+from tactomo_models.errors import ArtifactError, DataError, os_errors_as
 from tactomo_models.physics.bare_sheet import BareSheet, solve_bare_sheet
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.greens import PackedGreensFunction
@@ -140,12 +140,9 @@ def save_artifact(artifact: Artifact, path: Path) -> None:
     for name in _BARE_ARRAYS:
         arrays[name] = getattr(artifact.bare, name)
     arrays["content_sha256"] = _sha256_of(arrays)
-    try:
+    next_step = "free some space or name another path"
+    with os_errors_as(ArtifactError, f"cannot write {path}", next_step):
         write_whole(path, lambda file: np.savez(file, **arrays))
-    except OSError as error:
-        raise ArtifactError(
-            f"cannot write {path}: {error.strerror}; free some space or name another path"
-        ) from error
 
 
 def _sha256_of(arrays: Mapping[str, object]) -> str:

@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 
 from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.physics.greens import GreensFunction, PackedGreensFunction
-from tactomo_models.physics.mesh import SheetMesh
+from tactomo_models.physics.mesh import SheetMesh, hat_gradients
 from tactomo_models.sensor.description import SensorDescription
 
 NEAREST = 24  # triangles by their middles, among which a place's own is: refined ones are smaller
@@ -227,7 +227,8 @@ def assemble_sheet(
     for index, pad, triangles, shares in sheet.pads:
         # It meets the sheet all over; in all as a rim electrode as long as its circumference.
         radius_m = pad.radius_m
-        weight = shares * _areas(mesh)[triangles, None, None] * 2 / radius_m / contact_m[index]
+        _, area = hat_gradients(mesh.p[:, mesh.t[:, triangles]])
+        weight = shares * area[:, None, None] * 2 / radius_m / contact_m[index]
         corners = mesh.t[:, triangles].T  # (n, 3)
         rows.append(np.repeat(corners, 3, axis=1).ravel())
         columns.append(np.tile(corners, 3).ravel())
@@ -245,12 +246,6 @@ def assemble_sheet(
     terms = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
     stiffness.resize(size, size)
     return (stiffness + sp.csr_matrix(terms, (size, size)))[:-1, :-1].tocsc()
-
-
-def _areas(mesh: skfem.MeshTri) -> FloatArray:
-    """Area of each triangle, (T,)."""
-    a, b, c = mesh.p[:, mesh.t].transpose(1, 0, 2)
-    return np.asarray(np.abs((b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0]) / 2)
 
 
 def _map_weights(description: SensorDescription, mesh: skfem.MeshTri) -> sp.csr_matrix:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -177,7 +178,7 @@ class Solution:
 
 
 class CompiledSheet:
-    """Solves and differentiates a sheet.
+    """Solves and differentiates a sheet; `ForwardModel` makes it of a sensor.
 
     Args:
         bare: the sheet.
@@ -190,7 +191,7 @@ class CompiledSheet:
         self, bare: BareSheet, arrays: Mapping[str, FloatArray | IntArray | BoolArray]
     ) -> None:
         LIBRARY.load()  # where it is not there, nobody should wait for the first press to know
-        self._bare = bare
+        self.bare = bare
         self._kept = {name: np.ascontiguousarray(arrays[name]) for name in _ARRAYS}
         counts = {
             "triangles": len(arrays["area"]),
@@ -217,7 +218,7 @@ class CompiledSheet:
         self._even = np.ones(self._sheet.voltages)
         self._last: CompiledAreas | None = None
 
-    def areas(self, where: IntArray) -> CompiledAreas:
+    def _areas(self, where: IntArray) -> CompiledAreas:
         """Areas around pressable nodes; those of the last solve where these are the very same."""
         last = self._last
         if last is not None and np.array_equal(last.where, where):
@@ -226,26 +227,47 @@ class CompiledSheet:
 
     def _green(self, areas: CompiledAreas) -> FloatArray | None:
         """Blocks of a Green's function that is in pieces, for C; None where C can look them up."""
-        if isinstance(self._bare.green, PackedGreensFunction) or areas.found.is_known:
+        if isinstance(self.bare.green, PackedGreensFunction) or areas.found.is_known:
             return None
-        return np.ascontiguousarray(self._bare.green.between(areas.rim, areas.rim))
+        return np.ascontiguousarray(self.bare.green.between(areas.rim, areas.rim))
 
-    def solve(
-        self,
-        areas: CompiledAreas,  # around it
-        pressed: Pressed | None,  # what presses; None where `change` is given
-        data: CompiledData | None,  # what was measured; None where nothing is compared
-        change: FloatArray | None = None,  # (P,) conductivity minus the bare sheet's
-        *,
-        mix_resistivities: bool = False,  # see `ForwardModel.solve`
-    ) -> tuple[Solution, FloatArray]:
-        """Solve for what is pressed, and compare it with data.
+    def solve(self, change: FloatArray, *, mix_resistivities: bool = False) -> Solution:
+        """Solve for a pressed sheet.
+
+        Args:
+            change: (P,) conductivity minus the bare sheet's at the pressable nodes.
+            mix_resistivities: a triangle's resistivity, not its conductivity, is the mean of its
+                corners'. Across the edge of what conducts far better than the sheet, current
+                meets the two in series: there this keeps an edge where its nodes put it, whatever
+                the contrast (to 0.3 mm of 3 mm triangles; otherwise it is off by up to 0.9 mm).
+                Triangles with a corner that conducts worse than the sheet mix conductivities.
+
+        Raises numpy.linalg.LinAlgError where a conductivity is not above 0.
+        """
+        where = np.flatnonzero(change)
+        pressing = _Pressing(len(where), mix_resistivities, 0)
+        return self._solve(where, pressing, change=change)[0]
+
+    def evaluate(self, pressed: Pressed, data: CompiledData) -> tuple[Solution, FloatArray]:
+        """Solve for what is pressed and compare its relative voltage changes with data.
 
         Returns:
             The solution, and the weighted residual (M,) of the data.
 
         Raises numpy.linalg.LinAlgError where a conductivity is not above 0.
         """
+        addresses = pressed.response.address, data.address
+        return self._solve(pressed.where, _pressing(pressed), *addresses)
+
+    def _solve(
+        self,
+        where: IntArray,  # (n,) pressable nodes that change
+        pressing: _Pressing,
+        response: Any = None,  # these two for C; None where nothing is compared
+        data: Any = None,
+        change: FloatArray | None = None,  # (P,) where no response tells it
+    ) -> tuple[Solution, FloatArray]:
+        areas = self._areas(where)
         found, sheet = areas.found, self._sheet
         sizes = (sheet.pressable, sheet.voltages, sheet.voltages, found.nodes * sheet.fields)
         kept = np.empty(sum(sizes) + found.rim * sheet.fields)
@@ -253,8 +275,7 @@ class CompiledSheet:
         place = address(kept)
         if change is not None:
             kept[: ends[0]] = change
-        pressing = _pressing(pressed, areas.where, mix_resistivities)
-        pressing.change = place
+        pressing.where, pressing.change = address(areas.where), place
         pressing.voltages, pressing.residual = place + 8 * ends[0], place + 8 * ends[1]
         pressing.potentials, pressing.injected = place + 8 * ends[2], place + 8 * ends[3]
         green = self._green(areas)
@@ -262,8 +283,8 @@ class CompiledSheet:
             self._address,
             ctypes.byref(found),
             None if green is None else at(green),
-            None if pressed is None else pressed.response.address,
-            None if data is None else data.address,
+            response,
+            data,
             ctypes.byref(pressing),
         )
         _check(made)
@@ -282,16 +303,19 @@ class CompiledSheet:
 
     def slopes(
         self,
-        areas: CompiledAreas,  # around what is pressed
-        solution: Solution,  # its solution
-        potentials: FloatArray,  # (n, L - 1) at the areas' nodes
-        pressed: Pressed,  # what presses
+        solution: Solution,  # that of `evaluate`
+        pressed: Pressed,  # what presses on p nodes
         data: CompiledData,  # what was measured
-        by_share: FloatArray,  # (p, N) derivatives of the shares by the parameters
+        by_share: FloatArray,  # (p, N) derivatives of the shares by N parameters
         by_pressure: FloatArray,  # (p, N) those of the pressures
     ) -> FloatArray:
-        """Derivative (M, N + 1) of the weighted residual by N parameters and the log ratio."""
-        pressing = _pressing(pressed, areas.where, solution.mixes_resistivities)
+        """Derivative (M, N + 1) of the weighted residual, by the parameters and the log ratio."""
+        areas, potentials = self._around(solution, pressed.where)
+        pressing = _pressing(pressed)
+        pressing.where, pressing.mixes_resistivities = (
+            address(areas.where),
+            solution.mixes_resistivities,
+        )
         pressing.change, pressing.potentials = address(solution.change), address(potentials)
         jacobian = np.empty((self._sheet.voltages, by_share.shape[1] + 1))
         made = LIBRARY.evaluate_slopes(
@@ -306,14 +330,39 @@ class CompiledSheet:
         _check(made)
         return jacobian
 
+    def _around(self, solution: Solution, where: IntArray) -> tuple[CompiledAreas, FloatArray]:
+        """Areas around pressable nodes, and a solution's potentials (n, L - 1) there."""
+        areas = solution.areas
+        if areas.where is where or np.array_equal(areas.where, where):
+            return areas, solution.potentials
+        areas = self._areas(where)
+        return areas, self.potentials(solution, areas.nodes)
+
+    def potentials(self, solution: Solution, nodes: IntArray) -> FloatArray:
+        """Potentials (n, L - 1) of a pressed sheet at n positions in `BareSheet.support`."""
+        position = positions(solution.nodes, len(self.bare.support))[nodes]
+        outside = position < 0
+        potentials = np.empty((len(nodes), self.bare.potentials.shape[1]))
+        potentials[~outside] = solution.potentials[position[~outside]]
+        others = nodes[outside]
+        moved = self.bare.green.between(others, solution.rim) @ solution.injected
+        potentials[outside] = self.bare.potentials[others] + moved
+        return potentials
+
     def jacobian(
         self,
-        areas: CompiledAreas,
-        solution: Solution,
-        potentials: FloatArray,
-        onto: FloatArray | None,
+        solution: Solution,  # where to differentiate
+        where: IntArray,  # (n,) pressable nodes
+        # (n, K) derivative of these nodes' conductivities by K parameters: sooner done here than
+        # with the (M, n) derivative by nodes
+        onto: FloatArray | None = None,
     ) -> FloatArray:
-        """Derivative (M, K) of the voltages by parameters; see `ForwardModel.jacobian`."""
+        """Derivative of the voltages with respect to conductivity.
+
+        Returns:
+            (M, K), or (M, n) by the nodes' relative conductivity (the paper's equation 2).
+        """
+        areas, potentials = self._around(solution, where)
         onto = None if onto is None else np.ascontiguousarray(onto, np.float64)
         count = len(areas.where) if onto is None else onto.shape[1]
         jacobian = np.empty((self._sheet.voltages, count))
@@ -330,17 +379,23 @@ class CompiledSheet:
         return jacobian
 
 
-def _pressing(pressed: Pressed | None, where: IntArray, mix_resistivities: bool) -> _Pressing:
-    if pressed is None:
-        return _Pressing(len(where), mix_resistivities, address(where))
+def _pressing(pressed: Pressed) -> _Pressing:
+    """What presses, for C; which of the areas' nodes that is about is still to be said."""
     return _Pressing(
-        len(where),
+        len(pressed.where),
         pressed.mixes_resistivities,
-        address(where),
+        0,
         address(pressed.share),
         address(pressed.pressure_kpa),
         pressed.log_ratio,
     )
+
+
+def positions(members: IntArray, count: int) -> IntArray:
+    """Where each number below `count` stands among `members`; -1 for those that do not."""
+    position = np.full(count, -1)
+    position[members] = np.arange(len(members))
+    return position
 
 
 def _check(made: int) -> None:

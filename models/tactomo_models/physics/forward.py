@@ -30,13 +30,8 @@ import shapely
 
 from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.physics.bare_sheet import BareSheet, scan_voltages, volts_per_unit
-from tactomo_models.physics.compiled_sheet import (
-    CompiledAreas,
-    CompiledData,
-    CompiledSheet,
-    Pressed,
-    Solution,
-)
+from tactomo_models.physics.compiled_sheet import CompiledSheet, Solution, positions
+from tactomo_models.physics.mesh import hat_gradients
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.sheet import Ring
 
@@ -51,7 +46,7 @@ class Probes:
     gradient: sp.csr_matrix  # (2 C, S) of potentials at the support nodes, averaged
 
 
-class ForwardModel:
+class ForwardModel(CompiledSheet):
     """Voltages and their derivatives for relative conductivities on the pressable nodes.
 
     Args:
@@ -65,16 +60,13 @@ class ForwardModel:
 
     def __init__(self, description: SensorDescription, bare: BareSheet) -> None:
         self.description = description
-        self.bare = bare
         self.volts_per_unit = volts_per_unit(description)
         self.bare_voltages = scan_voltages(description, bare.transfer)
+        self.bare = bare
         self._index_pairs()
         self._index_triangles()
         self._index_nodes()
-        self._compiled = self._compile()
-
-    def _compile(self) -> CompiledSheet:
-        pairs = self.description.pairs
+        pairs = description.pairs
         arrays = {
             "corner_support": self._corner_support,
             "corner_pressable": self._corner_pressable,
@@ -87,8 +79,8 @@ class ForwardModel:
             "area": self._area,
             "conductivity": self._bare_conductivity,
             "at_rest": self.at_rest,
-            "potentials": self.bare.potentials,
-            "transfer": self.bare.transfer,
+            "potentials": bare.potentials,
+            "transfer": bare.transfer,
             "bare_voltages": self.bare_voltages,
             "electrodes": np.concatenate([pairs.drive, pairs.measure], axis=1),
             "pair": self._different_pairs,
@@ -96,7 +88,7 @@ class ForwardModel:
             "product_of": self._product_of,
             "sign": self._sign,
         }
-        return CompiledSheet(self.bare, arrays)
+        super().__init__(bare, arrays)
 
     def _index_pairs(self) -> None:
         """The different electrode pairs, and which two of them each voltage belongs to."""
@@ -120,13 +112,9 @@ class ForwardModel:
         nodes = bare.points.shape[1]
         touched = np.flatnonzero(np.isin(bare.triangles, bare.pressable).any(axis=0))
         corners = bare.triangles[:, touched]  # (3, t)
-        p = bare.points[:, corners]  # (2, 3, t)
-        edge = np.roll(p, -2, axis=1) - np.roll(p, -1, axis=1)  # opposite each corner
-        twice = edge[0, 1] * edge[1, 2] - edge[1, 1] * edge[0, 2]
-        gradient = np.stack([-edge[1], edge[0]]) / twice  # (2, 3, t) of each corner's hat function
-        self._corner_support = _positions(bare.support, nodes)[corners].T  # (t, 3)
-        self._corner_pressable = _positions(bare.pressable, nodes)[corners].T  # -1 elsewhere
-        self._area = np.abs(twice) / 2
+        gradient, self._area = hat_gradients(bare.points[:, corners])
+        self._corner_support = positions(bare.support, nodes)[corners].T  # (t, 3)
+        self._corner_pressable = positions(bare.pressable, nodes)[corners].T  # -1 elsewhere
         self._gradient = np.ascontiguousarray(gradient.transpose(2, 0, 1))  # (t, 2, 3)
         self._stiffness = self._area[:, None, None] * np.einsum(
             "tdi,tdj->tij", self._gradient, self._gradient
@@ -153,91 +141,6 @@ class ForwardModel:
         # electrode, or a triangle that cannot be pressed, is part of the balance.
         left = np.abs(law @ self.bare.potentials).max(axis=1)
         self._closed = left < 1e-9 * (abs(law) @ np.abs(self.bare.potentials)).max(axis=1)
-
-    def solve(self, change: FloatArray, *, mix_resistivities: bool = False) -> Solution:
-        """Solve for a pressed sheet.
-
-        Args:
-            change: (P,) conductivity minus the bare sheet's at the pressable nodes.
-            mix_resistivities: a triangle's resistivity, not its conductivity, is the mean of its
-                corners'. Across the edge of what conducts far better than the sheet, current
-                meets the two in series: there this keeps an edge where its nodes put it, whatever
-                the contrast (to 0.3 mm of 3 mm triangles; otherwise it is off by up to 0.9 mm).
-                Triangles with a corner that conducts worse than the sheet mix conductivities.
-
-        Raises numpy.linalg.LinAlgError where a conductivity is not above 0.
-        """
-        areas = self._compiled.areas(np.flatnonzero(change))
-        return self._compiled.solve(areas, None, None, change, mix_resistivities=mix_resistivities)[
-            0
-        ]
-
-    def evaluate(self, pressed: Pressed, data: CompiledData) -> tuple[Solution, FloatArray]:
-        """Solve for what is pressed and compare its relative voltage changes with data.
-
-        Args:
-            pressed: what presses, and what that does to the sheet.
-            data: what was measured.
-
-        Returns:
-            The solution, and the weighted residual (M,) of the data.
-
-        Raises numpy.linalg.LinAlgError where a conductivity is not above 0.
-        """
-        return self._compiled.solve(self._compiled.areas(pressed.where), pressed, data)
-
-    def slopes(
-        self,
-        solution: Solution,  # that of `evaluate`
-        pressed: Pressed,  # what presses on p nodes
-        data: CompiledData,  # what was measured
-        by_share: FloatArray,  # (p, N) derivatives of the shares by N parameters
-        by_pressure: FloatArray,  # (p, N) those of the pressures
-    ) -> FloatArray:
-        """Derivative of the weighted residual of what is pressed.
-
-        Returns:
-            (M, N + 1), by the parameters and the log ratio.
-        """
-        areas, potentials = self._around(solution, pressed.where)
-        return self._compiled.slopes(
-            areas, solution, potentials, pressed, data, by_share, by_pressure
-        )
-
-    def _around(self, solution: Solution, where: IntArray) -> tuple[CompiledAreas, FloatArray]:
-        """Areas around pressable nodes, and a solution's potentials (n, L - 1) there."""
-        areas = solution.areas
-        if areas.where is where or np.array_equal(areas.where, where):
-            return areas, solution.potentials
-        areas = self._compiled.areas(where)
-        return areas, self.potentials(solution, areas.nodes)
-
-    def potentials(self, solution: Solution, nodes: IntArray) -> FloatArray:
-        """Potentials (n, L - 1) of a pressed sheet at n positions in `BareSheet.support`."""
-        position = _positions(solution.nodes, len(self.bare.support))[nodes]
-        outside = position < 0
-        potentials = np.empty((len(nodes), self.bare.potentials.shape[1]))
-        potentials[~outside] = solution.potentials[position[~outside]]
-        others = nodes[outside]
-        moved = self.bare.green.between(others, solution.rim) @ solution.injected
-        potentials[outside] = self.bare.potentials[others] + moved
-        return potentials
-
-    def jacobian(
-        self,
-        solution: Solution,  # where to differentiate
-        where: IntArray,  # (n,) pressable nodes
-        # (n, K) derivative of these nodes' conductivities by K parameters: sooner done here than
-        # with the (M, n) derivative by nodes
-        onto: FloatArray | None = None,
-    ) -> FloatArray:
-        """Derivative of the voltages with respect to conductivity.
-
-        Returns:
-            (M, K), or (M, n) by the nodes' relative conductivity (the paper's equation 2).
-        """
-        areas, potentials = self._around(solution, where)
-        return self._compiled.jacobian(areas, solution, potentials, onto)
 
     @property
     def node_areas_m2(self) -> FloatArray:
@@ -298,13 +201,6 @@ def _assembled(stiffness: FloatArray, corners: IntArray, nodes: int) -> sp.csr_m
     """Sum the (t, 3, 3) of triangles into one matrix on all nodes."""
     rows, columns = np.repeat(corners, 3, axis=1), np.tile(corners, (1, 3))
     return sp.csr_matrix((stiffness.ravel(), (rows.ravel(), columns.ravel())), (nodes, nodes))
-
-
-def _positions(members: IntArray, count: int) -> IntArray:
-    """Where each number below `count` stands among `members`; -1 for those that do not."""
-    position = np.full(count, -1)
-    position[members] = np.arange(len(members))
-    return position
 
 
 def _lists(owner: IntArray, member: IntArray, owners: int, fill: int) -> IntArray:

@@ -242,6 +242,13 @@ def _snap(mesh: skfem.MeshTri, ends: FloatArray) -> skfem.MeshTri:
     return skfem.MeshTri(points, mesh.t)
 
 
+def hat_gradients(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gradients (2, 3, T) of the hat functions of triangles' corners (2, 3, T), and areas (T,)."""
+    edge = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)  # opposite each corner
+    twice = edge[0, 1] * edge[1, 2] - edge[1, 1] * edge[0, 2]
+    return np.stack([-edge[1], edge[0]]) / twice, np.abs(twice) / 2
+
+
 def with_electrodes(mesh: skfem.MeshTri, description: SensorDescription) -> SheetMesh:
     """Find what each electrode covers, on a mesh with nodes at the electrodes' ends."""
     outline = description.sheet.outline
@@ -280,7 +287,6 @@ def _under(mesh: skfem.MeshTri, pad: Pad) -> tuple[IntArray, FloatArray]:
     under = np.linalg.norm(places - centre[:, None], axis=1) < pad.radius_m  # (n, q)
     near, under = near[under.any(axis=1)], under[under.any(axis=1)]
     shares = np.einsum("tq,aq,bq->tab", under.astype(float), hats, hats) / len(first)
-    a, b, c = corners[:, :, near].transpose(1, 0, 2)
-    area = np.abs((b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0]) / 2
+    _, area = hat_gradients(corners[:, :, near])
     covered = (under.mean(axis=1) * area).sum()
     return near, shares * np.pi * pad.radius_m**2 / covered

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.sensor.description import SensorDescription
+from tactomo_models.sensor.pattern import scan_positions
 
 # Four turns, each also of the mirror image.
 _TURNS = tuple(
@@ -42,12 +43,7 @@ def _symmetry(description: SensorDescription, matrix: FloatArray) -> Symmetry | 
     electrodes = _goes_to(description.electrode_centres_m, matrix)
     if nodes is None or electrodes is None:
         return None
-    place = {
-        (*drive, *measure): index
-        for index, (drive, measure) in enumerate(
-            zip(description.pairs.drive.tolist(), description.pairs.measure.tolist(), strict=True)
-        )
-    }
+    place = scan_positions(description.pairs)
     scan = np.empty(len(place), np.intp)
     sign = np.empty(len(place))
     for index, (drive, measure) in enumerate(

@@ -64,7 +64,8 @@ class SkinSimulator:
         """
         scene = tuple(presses)
         if self._last is None or self._last[0] != scene:
-            self._last = (scene, {name: self._solve(name, scene) for name in self.channels})
+            channels = self.description.channels
+            self._last = (scene, {name: self.solve(self.ratio(name, scene)) for name in channels})
         return self._last[1]
 
     def forces_n(self, presses: Sequence[Press]) -> dict[str, float]:
@@ -75,14 +76,6 @@ class SkinSimulator:
             for name, one in self.description.companion.items()
         }
 
-    @property
-    def channels(self) -> tuple[Channel, ...]:
-        """The channels that the sensor has."""
-        return self.description.channels
-
-    def _solve(self, channel: Channel, scene: tuple[Press, ...]) -> FloatArray:
-        return self.solve(self.ratio(channel, scene))
-
     def voltages_under(
         self,
         pressure_kpa: FloatArray,  # (P,) where the nodes are covered
@@ -91,7 +84,7 @@ class SkinSimulator:
         """Noise-free voltages (M,) of each channel for any pressure at the nodes."""
         return {
             name: self.solve(conductivity_ratio(self.description, name, pressure_kpa, coverage))
-            for name in self.channels
+            for name in self.description.channels
         }
 
     def ratio(self, channel: Channel, presses: Sequence[Press]) -> FloatArray:

@@ -76,7 +76,7 @@ class DriftingSkin:
         self._seed = seed
         self._swing = (0.0, 0.0)
         self._swings_from_s = 0.0
-        self._creep = {name: _Creep() for name in simulator.channels}
+        self._creep = {name: _Creep() for name in simulator.description.channels}
         rng = np.random.default_rng([seed, 7])
         electrodes = simulator.description.electrode_count
         self._wander_s = rng.uniform(*WANDER_S, electrodes)
@@ -92,7 +92,7 @@ class DriftingSkin:
         return {
             name: self._pressed(name, drift, tuple(presses), time_s)
             * np.exp(self._by_itself(name, drift, time_s))
-            for name in self._simulator.channels
+            for name in self._simulator.description.channels
         }
 
     def _pressed(
@@ -115,7 +115,7 @@ class DriftingSkin:
 
     @cached_property
     def _unevenly(self) -> dict[Channel, FloatArray]:
-        names = self._simulator.channels
+        names = self._simulator.description.channels
         rngs = [np.random.default_rng([self._seed, number]) for number in range(len(names))]
         fields = [self._simulator.smooth_field(rng) for rng in rngs]
         return {

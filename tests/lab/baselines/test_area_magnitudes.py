@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from measured import measured
-from tactomo_lab.baselines.area_magnitudes import fit_magnitudes
+from tactomo_lab.baselines.paper_methods import fit_magnitudes
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scene.areas import AreaFinder, Areas

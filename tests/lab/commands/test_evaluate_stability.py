@@ -55,8 +55,7 @@ def test_in_numbers_words_and_pictures(stability: Run, tmp_path: Path) -> None:
     words = stability(*some)
     assert words.returncode == 0
     assert "Simulated, not measured: small, tuning seeds" in words.stdout
-    assert "A lead that opens after the tare." in words.stdout
-    assert "electrode_fault 1" in words.stdout
+    assert "dead-lead" in words.stdout
     assert "bad maps" in words.stdout
 
 

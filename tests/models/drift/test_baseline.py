@@ -21,7 +21,7 @@ from tactomo_models import (
     SkinSimulator,
 )
 from tactomo_models.arrays import FloatArray
-from tactomo_models.drift.press_memory import CREEP
+from tactomo_models.drift.drift_model import CREEP
 from tactomo_protocol import Channel
 
 Presses = tuple[Press, ...]

@@ -22,8 +22,7 @@ from tactomo_models import (
     load_description,
 )
 from tactomo_models.arrays import FloatArray
-from tactomo_models.drift.drift_model import DriftSubspace
-from tactomo_models.drift.press_memory import PressMemory
+from tactomo_models.drift.drift_model import DriftSubspace, PressMemory
 from tactomo_models.physics.artifact import load_or_build_artifact
 from tactomo_models.physics.bare_sheet import scan_voltages, solve_bare_sheet, transfer_resistances
 from tactomo_models.physics.forward import ForwardModel
