@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from tactomo.cli.console import Console
     from tactomo_models import SensorDescription
 
-    from tactomo_lab.evaluation.paper import Frame, Indentation, Rig
+    from tactomo_lab.evaluation.paper import Arrangement, Frame, Rig
 
-FIGURES = (5, 8, 9, 10)
+FIGURES = (5, 8, 9, 10, 11, 12)
 
 
 class _Part(NamedTuple):
@@ -55,13 +55,15 @@ app = options.typer_app()
     )
 )
 def paper(
-    figure: Annotated[str, typer.Option(help="The paper's figures, with commas.")] = "5,8,9,10",
+    figure: Annotated[
+        str, typer.Option(help="The paper's figures, with commas.")
+    ] = "5,8,9,10,11,12",
     count: Annotated[
         int, typer.Option(min=1, help="Fig. 5: scenes of each number of contacts.")
     ] = 100,
-    sheets: Annotated[int, typer.Option(min=1, help="Figs. 8 to 10: sensors to press.")] = 3,
+    sheets: Annotated[int, typer.Option(min=1, help="Figs. 8 to 12: sensors to press.")] = 3,
     snr: Annotated[
-        float, typer.Option(help="Figs. 8 to 10: SNR of the voltages at rest, in dB.")
+        float, typer.Option(help="Figs. 8 to 12: SNR of the voltages at rest, in dB.")
     ] = 60.0,
     method: Annotated[
         list[str] | None,
@@ -73,7 +75,7 @@ def paper(
 ) -> None:
     """Repeat the paper's evaluation on simulated skins, beside the paper's printed numbers.
 
-    The paper's Figs. 8 to 10 were measured on hardware; tactomo's figures are simulated, on sheets
+    The paper's Figs. 8 to 12 were measured on hardware; tactomo's figures are simulated, on sheets
     uneven by 5 % with noise on every voltage. Fig. 5 is simulated in both: even sheets, ellipses
     that conduct worse than the sheet, white noise relative to the rms of the voltage changes. The
     first run simulates (half a second a scene) and keeps the voltages in the cache.
@@ -89,14 +91,14 @@ def paper(
     rigs = [Rig(description, seeds, number, snr_db=snr) for number in numbers]
     study = _Study(description, seeds, count, rigs, methods)
     parts = [
-        experiment(study)
+        experiment(study, asked)
         for of_figures, experiment in EXPERIMENTS.items()
-        if figures.intersection(of_figures)
+        if (asked := figures.intersection(of_figures))
     ]
 
     def show(console: Console) -> None:
         console.print(
-            f"Ours are simulated, not measured: {description.name}, {seeds} seeds; Figs. 8 to 10 "
+            f"Ours are simulated, not measured: {description.name}, {seeds} seeds; Figs. 8 to 12 "
             f"on {sheets} uneven sheet(s), {snr:g} dB of the voltages at rest, one scan a press."
         )
         for part in parts:
@@ -117,7 +119,7 @@ def paper(
     tell(told, as_json, show)
 
 
-def _simulation_study(study: _Study) -> _Part:
+def _simulation_study(study: _Study, asked: set[int]) -> _Part:
     from tactomo_lab.evaluation.paper import COUNTS, SNR_DB, cells, paper_scenes
     from tactomo_lab.evaluation.play import play
 
@@ -145,7 +147,7 @@ def _simulation_study(study: _Study) -> _Part:
     )
 
 
-def _single_areas(study: _Study) -> _Part:
+def _single_areas(study: _Study, asked: set[int]) -> _Part:
     from tactomo_lab.evaluation.paper import PAPER_MAGNITUDE_ERROR, SINGLE, magnitude_errors
 
     frames = _image(study, SINGLE, "Figs. 8 and 9")
@@ -170,7 +172,7 @@ def _single_areas(study: _Study) -> _Part:
                 "method": frame.method,
                 "sheet": frame.sheet,
                 "case": frame.case.number,
-                "pressure_kpa": frame.pressure_kpa,
+                "pressure_kpa": frame.pressures_kpa[0],
                 "value": frame.estimate,
             }
             for frame in frames
@@ -189,7 +191,7 @@ def _single_areas(study: _Study) -> _Part:
     )
 
 
-def _localisation(study: _Study) -> _Part:
+def _localisation(study: _Study, asked: set[int]) -> _Part:
     from tactomo_lab.evaluation.paper import LOCALISATION, PAPER_LOCALISATION_MM, locate
 
     places = [locate(frame, study.description) for frame in _image(study, LOCALISATION, "Fig. 10")]
@@ -220,14 +222,56 @@ def _localisation(study: _Study) -> _Part:
     )
 
 
-EXPERIMENTS: dict[tuple[int, ...], Callable[[_Study], _Part]] = {
+def _several_areas(study: _Study, asked: set[int]) -> _Part:
+    from tactomo_lab.evaluation.paper import MORE, TWO, read_areas
+    from tactomo_lab.scenes.measures import mean
+
+    cases = {number: {11: TWO, 12: MORE}[number] for number in sorted(asked)}
+    chosen = list(chain.from_iterable(cases.values()))
+    frames = _image(study, chosen, " and ".join(f"Fig. {number}" for number in cases))
+    read = [read_areas(frame, study.description) for frame in frames]
+    columns = ("ICC", "told apart", "in order", "alike", "counted")
+    made = table("case", "method", *columns, left=("method",))
+    for case in chosen:
+        for method in study.methods:
+            of = [one for one in read if (one.case, one.method) == (case.number, method)]
+            made.add_row(
+                (f"{case.number}{'*' * case.ours}" if method == study.methods[0] else ""),
+                method,
+                f"{mean(one.icc for one in of):.3f}",
+                f"{mean(one.told_apart for one in of):.0%}",
+                f"{mean(right for one in of for right in one.ordered):.0%}",
+                f"{mean(share for one in of for share in one.alike):.0%}",
+                f"{mean(one.counted for one in of):.0%}",
+            )
+        made.add_section()
+    facts = {
+        number: [
+            asdict(one) | {"ordered": one.ordered, "alike": one.alike}
+            for one in read
+            if one.case in {case.number for case in of_figure}
+        ]
+        for number, of_figure in cases.items()
+    }
+    return _Part(
+        "Figs. 11 and 12: two to four areas, simulated; the paper prints no numbers",
+        made,
+        "told apart: the image falls below half between any two areas; in order: pairs of which "
+        "the harder pressed one reads higher; alike: of pairs under one pressure, the lower "
+        "reading over the other; counted: right number of contacts; *: places and sizes are ours",
+        facts,
+    )
+
+
+EXPERIMENTS: dict[tuple[int, ...], Callable[[_Study, set[int]], _Part]] = {
     (5,): _simulation_study,
     (8, 9): _single_areas,
     (10,): _localisation,
+    (11, 12): _several_areas,
 }
 
 
-def _image(study: _Study, cases: Sequence[Indentation], what: str) -> list[Frame]:
+def _image(study: _Study, cases: Sequence[Arrangement], what: str) -> list[Frame]:
     from tactomo_lab.evaluation.paper import image_cases
 
     presses = sum(len(case.pressures_kpa) for case in cases)

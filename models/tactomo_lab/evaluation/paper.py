@@ -4,7 +4,7 @@ Its simulation study (Fig. 5) is repeated as it is described: one to four ellips
 worse than an even sheet, a contrast of 100 in the structure channel, white Gaussian noise. "SNR of
 the data" is read as that of the voltage *changes*, which are the data of its equations.
 
-Its experiments (Figs. 8 to 10) were made with hardware: round indenters on a real skin. Here they
+Its experiments (Figs. 8 to 12) were made with hardware: round indenters on a real skin. Here they
 are made with simulated ones, `Rig`: sheets uneven by 5 %, contact impedances by 20 %, conductivity
 that rises under pressure, noise of equal size on every voltage, one scan a press after one tare.
 The paper has one sensor; here several sheets tell what is chance.
@@ -16,10 +16,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import combinations, product
 from typing import Any, Final
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scene.contacts import Contact
@@ -41,7 +42,7 @@ from tactomo_lab.scenes.case import (
 )
 from tactomo_lab.scenes.case import Frame as CaseFrame
 from tactomo_lab.scenes.drawing import BOTH_CHANNELS, SeedSet, require_channels, seed_of
-from tactomo_lab.scenes.measures import Summary, full_range, summarise
+from tactomo_lab.scenes.measures import Summary, correlation, full_range, summarise
 from tactomo_lab.scenes.presets import PAPER_CONTACTS, PAPER_CONTRAST, paper_presses
 from tactomo_lab.scenes.simulation import Truth, Volts
 from tactomo_lab.scenes.still_scenes import still_case
@@ -123,40 +124,82 @@ def cells(outcomes: Iterable[Outcome]) -> list[Cell]:
     return [Cell(*key, summarise(of_cell)) for key, of_cell in scores.items()]
 
 
-# ------------------------------------------------------------------ Figs. 8 to 10: experiments
+# ------------------------------------------------------------------ Figs. 8 to 12: experiments
 
 
 @dataclass(frozen=True)
-class Indentation:
-    """A round indenter in one place, on the paper's sensor of 150 mm, pressed in turn."""
+class Area:
+    """A round indenter, on the paper's sensor of 150 mm."""
 
-    number: int  # the paper's; 0 of Fig. 10, whose places have none
     x_mm: float
     y_mm: float
     diameter_mm: float = 30.0
-    pressures_kpa: tuple[float, ...] = CASE_KPA
-
-    def press(self, description: SensorDescription, pressure_kpa: float) -> Press:
-        """Press another sensor in the place, and on the area, of the same share of its width."""
-        millimetre_m = description.width_m / PAPER_WIDTH_MM
-        return Press(
-            self.x_mm * millimetre_m,
-            self.y_mm * millimetre_m,
-            pressure_kpa,
-            self.diameter_mm / 2 * millimetre_m,
-        )
 
 
+@dataclass(frozen=True)
+class Arrangement:
+    """One arrangement of indenters, pressed in one or more ways."""
+
+    number: int  # the paper's
+    areas: tuple[Area, ...]  # A1, A2, ...
+    pressures_kpa: tuple[tuple[float, ...], ...]  # of each area, for each way
+    # whether the arrangement is ours: the paper shows its own in a picture alone
+    ours: bool = False
+
+
+def _single(number: int, x_mm: float, y_mm: float, diameter_mm: float) -> Arrangement:
+    return Arrangement(number, (Area(x_mm, y_mm, diameter_mm),), tuple((kpa,) for kpa in CASE_KPA))
+
+
+LOW, HIGH = CASE_KPA[0], CASE_KPA[-1]
+BOTH_WAYS: Final = tuple(product((LOW, HIGH), repeat=2))
 SINGLE: Final = (
-    Indentation(1, 0, 0),
-    Indentation(2, 36, 36),
-    Indentation(3, 0, 0, 40),
-    Indentation(4, 36, 36, 40),
+    _single(1, 0, 0, 30),
+    _single(2, 36, 36, 30),
+    _single(3, 0, 0, 40),
+    _single(4, 36, 36, 40),
 )
+TWO: Final = (
+    Arrangement(5, (Area(0, 0), Area(36, 36)), BOTH_WAYS),
+    Arrangement(6, (Area(-36, -36, 40), Area(36, 36)), BOTH_WAYS),
+)
+MORE: Final = (
+    Arrangement(7, (Area(-36, -36), Area(36, -36), Area(0, 36)), ((HIGH, LOW, HIGH),), ours=True),
+    Arrangement(8, (Area(-36, 36, 40), Area(36, 36), Area(0, -36)), ((LOW, HIGH, LOW),), ours=True),
+    Arrangement(
+        9,
+        (Area(-36, -36), Area(36, -36), Area(36, 36), Area(-36, 36)),
+        ((HIGH, LOW, LOW, HIGH),),
+        ours=True,
+    ),
+    Arrangement(
+        10,
+        (Area(-36, -36, 40), Area(36, -36), Area(36, 36), Area(-36, 36, 40)),
+        ((HIGH, LOW, HIGH, LOW),),
+        ours=True,
+    ),
+)
+# Fig. 10 is one area pressed in turn in 25 places, which have no number of their own.
+PLACES_MM: Final = tuple(product(GRID_MM * np.arange(-2, 3), repeat=2))
 LOCALISATION: Final = tuple(
-    Indentation(0, float(x_mm), float(y_mm), pressures_kpa=CASE_KPA[-1:])
-    for y_mm, x_mm in product(GRID_MM * np.arange(-2, 3), repeat=2)
+    Arrangement(0, (Area(float(x_mm), float(y_mm)),), ((HIGH,),)) for y_mm, x_mm in PLACES_MM
 )
+
+
+def presses_of(
+    description: SensorDescription, case: Arrangement, pressures_kpa: Sequence[float]
+) -> tuple[Press, ...]:
+    """A case's indenters on a sensor, of the same share of its width as on the paper's."""
+    millimetre_m = description.width_m / PAPER_WIDTH_MM
+    return tuple(
+        Press(
+            area.x_mm * millimetre_m,
+            area.y_mm * millimetre_m,
+            kpa,
+            area.diameter_mm / 2 * millimetre_m,
+        )
+        for area, kpa in zip(case.areas, pressures_kpa, strict=True)
+    )
 
 
 class Rig:
@@ -211,8 +254,8 @@ class Rig:
 class Frame:
     """What a method made of one press of one case."""
 
-    case: Indentation
-    pressure_kpa: float
+    case: Arrangement
+    pressures_kpa: tuple[float, ...]
     sheet: int
     method: str
     made: Reconstruction
@@ -231,16 +274,19 @@ class Frame:
 
 
 def image_cases(
-    rigs: Iterable[Rig], cases: Sequence[Indentation], methods: Sequence[str]
+    rigs: Iterable[Rig], arrangements: Sequence[Arrangement], methods: Sequence[str]
 ) -> Iterator[Frame]:
-    """Press each sensor in each case and reconstruct it from a cold start by each method."""
-    for rig, case in product(rigs, cases):
+    """Press each arrangement on each sensor and reconstruct it from a cold start by each method."""
+    for rig in rigs:
         player = Player(rig.description)
-        for pressure_kpa in case.pressures_kpa:
-            pressed = rig.press((case.press(rig.description, pressure_kpa),))
-            for method in methods:
-                (played,) = player.play(pressed, Variant(method))
-                yield Frame(case, pressure_kpa, rig.sheet, method, played.made, pressed.truth)
+        for arrangement in arrangements:
+            for pressures_kpa in arrangement.pressures_kpa:
+                case = rig.press(presses_of(rig.description, arrangement, pressures_kpa))
+                for method in methods:
+                    (played,) = player.play(case, Variant(method))
+                    yield Frame(
+                        arrangement, pressures_kpa, rig.sheet, method, played.made, case.truth
+                    )
 
 
 def magnitude_estimate(values: FloatArray, method: str) -> float:
@@ -352,3 +398,67 @@ def locate(frame: Frame, description: SensorDescription) -> Localisation:
         len(frame.made.contacts),
         *errors_mm,
     )
+
+
+@dataclass(frozen=True)
+class SeveralAreas:
+    """How one frame of two to four areas came out, in numbers for Figs. 11 and 12."""
+
+    case: int  # the paper's number
+    pressures_kpa: tuple[float, ...]  # of its areas
+    method: str  # of reconstruction
+    sheet: int  # number of the sensor
+    icc: float  # of the map
+    # of each area, see `magnitude_estimate`, from the image within its outline
+    estimates: tuple[float, ...]
+    # whether, on the way between any two areas, the image falls below half of the paler one
+    told_apart: bool
+    counted: bool  # whether as many contacts were reported as press
+
+    @property
+    def ordered(self) -> tuple[bool, ...]:
+        """Of each pair of areas under unlike pressures: whether the harder pressed reads higher."""
+        return tuple((p - q) * (a - b) > 0 for (p, a), (q, b) in self._pairs() if p != q)
+
+    @property
+    def alike(self) -> tuple[float, ...]:
+        """Of each pair of areas under one pressure: the paler reading over the other one."""
+        return tuple(min(a, b) / (max(a, b) or 1.0) for (p, a), (q, b) in self._pairs() if p == q)
+
+    def _pairs(self) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
+        return combinations(zip(self.pressures_kpa, self.estimates, strict=True), 2)
+
+
+def read_areas(frame: Frame, description: SensorDescription) -> SeveralAreas:
+    """Measure a frame of several areas."""
+    presses = presses_of(description, frame.case, frame.pressures_kpa)
+    x, y = np.meshgrid(description.map_x_m, description.map_y_m)
+    inside = [press.coverage(x, y, edge_m=1e-9) > 0.5 for press in presses]
+    estimates = tuple(magnitude_estimate(frame.image[area], frame.method) for area in inside)
+    return SeveralAreas(
+        case=frame.case.number,
+        pressures_kpa=frame.pressures_kpa,
+        method=frame.method,
+        sheet=frame.sheet,
+        icc=correlation(frame.image, frame.truth.map),
+        estimates=estimates,
+        told_apart=_told_apart(frame.image, presses, estimates, description),
+        counted=len(frame.made.contacts) == len(presses),
+    )
+
+
+def _told_apart(
+    image: FloatArray,
+    presses: Sequence[Press],
+    estimates: Sequence[float],
+    description: SensorDescription,
+) -> bool:
+    grid = (description.map_y_m, description.map_x_m)
+    value = RegularGridInterpolator(grid, image)
+    share = np.linspace(0, 1, 101)[:, None]
+    for (one, high), (other, low) in combinations(zip(presses, estimates, strict=True), 2):
+        ends = [np.array([press.y_m, press.x_m]) for press in (one, other)]
+        between = value((1 - share) * ends[0] + share * ends[1])
+        if not between.min() < 0.5 * min(high, low):
+            return False
+    return True

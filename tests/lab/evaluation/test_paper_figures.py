@@ -9,9 +9,11 @@ import pytest
 from tactomo_lab.evaluation.paper import (
     CASE_KPA,
     LOCALISATION,
+    MORE,
     SINGLE,
+    TWO,
+    Arrangement,
     Frame,
-    Indentation,
     Rig,
     cells,
     image_cases,
@@ -20,16 +22,18 @@ from tactomo_lab.evaluation.paper import (
     magnitude_errors,
     magnitude_estimate,
     paper_scenes,
+    presses_of,
+    read_areas,
 )
 from tactomo_lab.evaluation.play import play
-from tactomo_lab.scenes.drawing import BOTH_CHANNELS, outline_of
+from tactomo_lab.scenes.drawing import BOTH_CHANNELS, gap_m, outline_of
 from tactomo_lab.scenes.simulation import truth_of
 from tactomo_models import Artifact, Reconstruction, SensorDescription, build_artifact
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scene.contacts import Contact
 from tactomo_protocol import Channel
 
-SHORT = [replace(case, pressures_kpa=(200.0,)) for case in SINGLE[:2]]
+SHORT = [replace(case, pressures_kpa=((200.0,),)) for case in SINGLE[:2]]
 
 
 @pytest.fixture(scope="module")
@@ -50,28 +54,33 @@ def _built(small_artifact: Artifact, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def frame(
     description: SensorDescription,
-    case: Indentation,
-    pressure_kpa: float,
+    case: Arrangement,
+    pressures_kpa: tuple[float, ...],
     image: FloatArray | None,
     method: str = "network",
     contacts: tuple[Contact, ...] = (),
 ) -> Frame:
     shown = None if image is None else image.astype(np.float32)
     made = Reconstruction(shown, None, None, contacts, "noser", "by hand", 1.0)
-    truth = truth_of(description, [case.press(description, pressure_kpa)])
-    return Frame(case, pressure_kpa, 0, method, made, truth)
+    truth = truth_of(description, presses_of(description, case, pressures_kpa))
+    return Frame(case, pressures_kpa, 0, method, made, truth)
 
 
 # ------------------------------------------------------------------ what is pressed
 
 
-def test_cases_fit_on_the_sheet(paper: SensorDescription) -> None:
-    assert [case.number for case in SINGLE] == [1, 2, 3, 4]
+def test_cases_fit_on_the_sheet_and_lie_apart(paper: SensorDescription) -> None:
+    assert [case.number for case in (*SINGLE, *TWO, *MORE)] == list(range(1, 11))
     assert len(LOCALISATION) == 25
-    for case in (*SINGLE, *LOCALISATION):
-        x, y = outline_of(case.press(paper, 200.0))
-        assert paper.on_sheet(x, y, paper.sheet.frame_width_m).all()
-    places = {(case.x_mm, case.y_mm) for case in LOCALISATION}
+    assert [len(case.pressures_kpa) for case in (*SINGLE, *TWO)] == [4, 4, 4, 4, 4, 4]
+    for case in (*SINGLE, *TWO, *MORE, *LOCALISATION):
+        for pressures_kpa in case.pressures_kpa:
+            presses = presses_of(paper, case, pressures_kpa)
+            for number, press in enumerate(presses):
+                x, y = outline_of(press)
+                assert paper.on_sheet(x, y, paper.sheet.frame_width_m).all()
+                assert all(gap_m(press, other) > 0.005 for other in presses[:number])
+    places = {(case.areas[0].x_mm, case.areas[0].y_mm) for case in LOCALISATION}
     assert places == {(18.0 * i, 18.0 * j) for i in range(-2, 3) for j in range(-2, 3)}
 
 
@@ -108,7 +117,7 @@ def test_points_of_the_simulation_study(small: SensorDescription) -> None:
 
 
 def test_a_rig_measures_one_uneven_sensor(small: SensorDescription, rig: Rig) -> None:
-    presses = (SINGLE[0].press(small, 200.0),)
+    presses = presses_of(small, SINGLE[0], (200.0,))
     quiet = Rig(small, "tuning", 0, snr_db=np.inf)
     other = Rig(small, "tuning", 1, snr_db=np.inf)
     case, again, silent = (each.press(presses) for each in (rig, Rig(small, "tuning", 0), quiet))
@@ -153,7 +162,7 @@ def test_the_magnitude_error_is_the_largest_spread_at_one_pressure(
     estimates = np.vstack([estimates, [0.05, 0.15, 0.12, 0.10]])  # the last one falls again
     contact = Contact(1, 0.0, 0.0, 1e-4, 0.1)
     frames = [
-        frame(small, case, kpa, np.full((21, 21), value), contacts=(contact,))
+        frame(small, case, (kpa,), np.full((21, 21), value), contacts=(contact,))
         for case, row in zip(SINGLE, estimates, strict=True)
         for kpa, value in zip(CASE_KPA, row, strict=True)
     ]
@@ -175,6 +184,25 @@ def test_the_mass_of_an_image(small: SensorDescription) -> None:
 
 
 def test_what_was_not_found_has_no_place(small: SensorDescription) -> None:
-    place = locate(frame(small, LOCALISATION[0], 200.0, None), small)
+    place = locate(frame(small, LOCALISATION[0], (200.0,), None), small)
     assert np.isnan([place.mass_error_mm, place.contact_error_mm]).all()
     assert place.contacts == 0
+
+
+def test_areas_of_one_image(small: SensorDescription) -> None:
+    case, pressures_kpa = TWO[0], (200.0, 140.0)
+    truth = frame(small, case, pressures_kpa, None).truth.map
+    read = read_areas(frame(small, case, pressures_kpa, truth), small)
+    assert read.told_apart
+    assert read.ordered == (True,)
+    assert read.alike == ()
+    assert read.icc == pytest.approx(1)
+    assert not read.counted
+    merged = read_areas(frame(small, case, pressures_kpa, truth + truth.max()), small)
+    assert not merged.told_apart
+    nothing = read_areas(frame(small, case, (200.0, 200.0), None), small)
+    assert not nothing.told_apart
+    assert nothing.alike == (0.0,)
+    half = replace(nothing, estimates=(0.1, 0.2))
+    assert half.alike == (0.5,)
+    assert replace(read, estimates=(0.1, 0.2)).ordered == (False,)
