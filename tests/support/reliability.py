@@ -44,6 +44,11 @@ These limits remain:
   look like drift, or like two contacts: pressures and places are then wrong, without a flag.
 - A structure port that reads the magnitude sheet, too, looks like a skin at rest: presses that the
   magnitude sheet does not feel are missing, without a flag. Harder presses are flagged.
+- Where one daemon reads the magnitude sheet of one skin and the structure sheet of another, a press
+  on the second is `below`, whatever its pressure; a press on the first is flagged or missing
+  ([what to do](many_skins.md#exchanged-cables)).
+- A gain that falls by a tenth under a press counts as drift, mostly without a flag: pressures keep
+  within two standard uncertainties, which grow to 14 kPa. Tare once nothing presses.
 
 Machine: {machine}.
 

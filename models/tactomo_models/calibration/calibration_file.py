@@ -125,6 +125,9 @@ class PressureCalibration(BaseModel, extra="forbid", frozen=True, allow_inf_nan=
             values = getattr(self, name)
             if not 0 <= min(values) <= max(values) <= most:
                 raise ValueError(f"{name} must be between 0 and {most:g}, as any skin's are")
+        for name in ("onset_kpa", "hysteresis_kpa", "repeatability_kpa"):
+            if abs(getattr(self, name) or 0.0) > MAX_KPA:
+                raise ValueError(f"{name} must be at most {MAX_KPA:g}, as any skin's is")
         return self
 
     @classmethod

@@ -231,6 +231,9 @@ def test_one_beside_the_description_is_found_too(
         ("extra", 1, "unknown key extra"),
         ("pressure_kpa", "negative", "pressure_kpa must be between 0"),
         ("sigma_kpa", "huge", "sigma_kpa must be between 0"),
+        ("onset_kpa", 1e308, "onset_kpa must be at most"),
+        ("hysteresis_kpa", -1e308, "hysteresis_kpa must be at most"),
+        ("repeatability_kpa", 1e308, "repeatability_kpa must be at most"),
     ],
 )
 def test_a_damaged_file_is_refused(
