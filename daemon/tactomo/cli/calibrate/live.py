@@ -12,10 +12,9 @@ import statistics
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from tactomo.cli.steer.watch import View
 from tactomo.errors import TactomoError, os_errors_as
@@ -40,15 +39,12 @@ COLUMNS: Final = (
 )
 
 
-@dataclass(frozen=True)
-class Held:
-    """A press that was still for a while."""
+class Held(NamedTuple):
+    """A press that was still for a while: means of some frames."""
 
-    # magnitude, magnitude_sigma, contact_mm2: means
     magnitude: float
     magnitude_sigma: float
     contact_mm2: float
-    # x_mm, y_mm: its place
     x_mm: float
     y_mm: float
     frames: int  # how many were averaged

@@ -111,7 +111,7 @@ class _Session:
         assert heard.after is not None
         devices = [port["device"]["device_id"] for port in heard.after["ports"] if port["device"]]
         self._subject = Subject.of(self._sensor, heard.layout, devices)
-        return {name: scans.mean(axis=0) for name, scans in heard.scans.items()}, heard.layout
+        return {name: each.volts.mean(axis=0) for name, each in heard.scans.items()}, heard.layout
 
     def _take_one(self, description: SensorDescription) -> bool:
         """Take one press, or undo one; returns whether to go on."""
@@ -135,7 +135,7 @@ class _Session:
             self._console.print(f"not taken: {why}")
             return True
         # One scan, not their mean: what is learnt is to hold for scans as noisy as they come.
-        last = {name: scans[-1] for name, scans in heard.scans.items()}
+        last = {name: each.volts[-1] for name, each in heard.scans.items()}
         place = {"xy_mm": np.array([x_mm, y_mm]), "force_n": np.array(force_n)}
         self._keep(slice(None), {**last, **place})
         return True
@@ -153,7 +153,7 @@ class _Session:
             return f"not to be trusted: {', '.join(flags)}; `tactomo tare` unpressed"
         if heard.pressed < heard.frames or not heard.frames:
             return "no contact was seen: press, then Enter, and hold for a second"
-        for name, scans in heard.scans.items():
+        for name, scans in ((name, each.volts) for name, each in heard.scans.items()):
             if f"{name}_reference" not in self._arrays:
                 return f"the {name} channel was missing in the scans at rest; begin anew"
             before, after = np.array_split(scans, 2)

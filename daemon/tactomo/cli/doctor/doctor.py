@@ -162,10 +162,10 @@ def _diagnose(evidence: Evidence) -> dict[str, Diagnosis]:
         has_channel = known is not None and name in known.channels
         found[name] = diagnose(
             layout,
-            scans,
-            times_s=evidence.times_s[name],
+            scans.volts,
+            times_s=scans.times_s,
             even=even,
-            saturated=evidence.saturated.get(name, 0),
+            saturated=scans.saturated,
             **({"contrast": known.contrast(name)} if has_channel else {}),  # type: ignore[arg-type, union-attr]
         )
     return found

@@ -59,17 +59,22 @@ class Heard(NamedTuple):
     period_ms: float | None
 
 
+@dataclass(frozen=True)
+class Scans:
+    """The scans of one channel."""
+
+    volts: FloatArray  # (T, M)
+    times_s: FloatArray | None  # (T,) when taken, on the device's clock; None where unknown
+    saturated: int = 0  # how many of them the device called clipped
+
+
 @dataclass
 class Evidence:
     """What was gathered."""
 
     title: str  # of what
     layout: Layout  # the sensor's description, or a pattern alone
-    scans: dict[str, FloatArray]  # (T, M) volts of each channel
-    # (T,) when they were taken, on the device's clock; None where unknown
-    times_s: dict[str, FloatArray | None]
-    # scans of each channel of which the device said that it clipped
-    saturated: dict[str, int] = field(default_factory=dict)
+    scans: dict[str, Scans]  # of each channel
     heard: Heard | None = None  # how they came; None for a file of arrays
     # before, after: the daemon's status then; empty but for a daemon
     before: Mapping[str, Any] = field(default_factory=dict)
@@ -114,10 +119,8 @@ def of_daemon(
             "`tactomo status` says what is wrong",
         )
     layout, notes = _layout_of_status(after, description)
-    scans, times_s = _scans_of_messages(said[SCAN])
-    evidence = Evidence(
-        f"the daemon of {sensor}, for {seconds:g} s", layout, scans, times_s, notes=notes
-    )
+    scans = _scans_of_messages(said[SCAN])
+    evidence = Evidence(f"the daemon of {sensor}, for {seconds:g} s", layout, scans, notes=notes)
     evidence.before, evidence.after = before, after
     evidence.heard = _heard_of_messages(said[SCAN], before, after)
     evidence.frames = len(said[MAP])
@@ -157,29 +160,24 @@ def _layout_of_status(
     return known, ()
 
 
-def _scans_of_messages(
-    messages: list[dict[str, Any]],
-) -> tuple[dict[str, FloatArray], dict[str, FloatArray | None]]:
+def _scans_of_messages(messages: list[dict[str, Any]]) -> dict[str, Scans]:
     from tactomo_client.messages import array_from_wire
 
-    scans: dict[str, FloatArray] = {}
-    times_s: dict[str, FloatArray | None] = {}
-    for channel in ("magnitude", "structure"):
+    scans = {}
+    for channel in Channel:
         there = [m for m in messages if m[channel] is not None]
         if there:
-            scans[channel] = np.array([array_from_wire(m[channel]) for m in there])
-            times_s[channel] = _times(
-                [m["device_us"] for m in there], [m["acquired_monotonic_ns"] for m in there]
-            )
-    return scans, times_s
+            volts = np.array([array_from_wire(m[channel]) for m in there])
+            times = [(m["device_us"], m["acquired_monotonic_ns"]) for m in there]
+            scans[str(channel)] = Scans(volts, _times(times))
+    return scans
 
 
-def _times(device_us: list[int], arrived_ns: list[int]) -> FloatArray:
-    """When scans were taken, s from the first: by the device's clock, or ours where it has none."""
-    device = np.array(device_us, dtype=np.float64)
-    if np.ptp(device):
-        return np.asarray((device - device[0]) * 1e-6)
-    return np.asarray((np.array(arrived_ns) - arrived_ns[0]) * 1e-9)
+def _times(of_scans: list[tuple[int, int]]) -> FloatArray:
+    """When scans were taken, s from the first: by the device's clock (µs), or ours (ns) without."""
+    times = np.array(of_scans, dtype=np.float64)
+    device_s, ours_s = ((times - times[0]) * (1e-6, 1e-9)).T
+    return np.asarray(device_s if device_s.any() else ours_s)
 
 
 def _heard_of_messages(
@@ -236,22 +234,22 @@ def of_recording(recording: Recording, description: str | None, frames: slice | 
     """
     known = load_description(description) if description else recording.origin.read_description()
     ports = [_scans_of_port(recording, n) for n in range(len(recording.origin.ports))]
-    scans: dict[str, FloatArray] = {}
-    times_s: dict[str, FloatArray | None] = {}
-    saturated: dict[str, int] = {}
-    for channel in Channel:
+    scans = {}
+    for channel in known.channels:
         taken = [scan for port in ports for scan in port if scan.channel is channel]
         taken = taken if frames is None else taken[frames]
-        if taken and channel in known.channels:
-            scans[channel] = np.array([scan.volts for scan in taken])
-            times_s[channel] = _times([s.device_us for s in taken], [s.arrived_ns for s in taken])
-            saturated[channel] = sum(bool(scan.flags & ScanFlag.SATURATED) for scan in taken)
+        if taken:
+            scans[str(channel)] = Scans(
+                np.array([scan.volts for scan in taken]),
+                _times([(scan.device_us, scan.arrived_ns) for scan in taken]),
+                sum(bool(scan.flags & ScanFlag.SATURATED) for scan in taken),
+            )
     if not scans:
         raise DoctorError(
             f"there are no scans of {known.name} in {recording.path}",
             "`tactomo info` shows what is in it; it may need another --description",
         )
-    evidence = Evidence(str(recording.path), known, scans, times_s, saturated)
+    evidence = Evidence(str(recording.path), known, scans)
     evidence.heard = _heard_on_ports(recording, ports)
     if not recording.summary.is_complete:
         evidence.notes = ("the recording was cut off: the rest was read",)
@@ -332,21 +330,16 @@ def of_arrays(
         names, how = (array or "volts",), f"read as {named}; no description of the sheet"
     del arrays  # else all scans are in memory twice
     read = read_scans(path, sensor, sensor.channels[-1], array=array, pattern=named)
-    scans: dict[str, FloatArray] = {}
-    times_s: dict[str, FloatArray | None] = {}
+    which = frames or slice(None)
+    times_s = None if read.time_s is None else read.time_s[which]
+    scans = {}
     for channel, volts in read.volts.items():
-        name = channel if channel in names else names[0]
-        scans[name], times_s[name] = volts, read.time_s
-        if frames is not None:
-            scans[name] = _cut(path, volts, frames)
-            times_s[name] = None if read.time_s is None else read.time_s[frames]
-    return Evidence(str(path), layout, scans, times_s, notes=(how, *read.notes))
-
-
-def _cut(path: Path, scans: FloatArray, frames: slice) -> FloatArray:
-    if not len(scans[frames]):
-        raise DoctorError(f"{path} has {len(scans)} scans, none of these", "give other --frames")
-    return scans[frames]
+        if not len(volts[which]):
+            raise DoctorError(
+                f"{path} has {len(volts)} scans, none of these", "give other --frames"
+            )
+        scans[channel if channel in names else names[0]] = Scans(volts[which], times_s)
+    return Evidence(str(path), layout, scans, notes=(how, *read.notes))
 
 
 def _at_rest(path: Path, arrays: Mapping[str, NDArray[Any]]) -> str:

@@ -52,7 +52,7 @@ def _packets_found(heard: Heard) -> Finding:
 
 
 def _lost_found(evidence: Evidence, lost: int) -> Finding:
-    count = max(len(scans) for scans in evidence.scans.values())
+    count = max(len(scans.volts) for scans in evidence.scans.values())
     figures: dict[str, Any] = {"number": float(lost)}
     if not lost:
         return Finding("lost_scans", Level.OK, f"none of {count} dual scans", "", figures)
