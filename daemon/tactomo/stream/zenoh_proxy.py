@@ -15,7 +15,7 @@ import zenoh
 import zmq
 from tactomo_client import MessageError
 from tactomo_client.messages import KINDS, STATUS, check_sensor_name
-from tactomo_client.schema import EVENTS, STALE_AFTER_S
+from tactomo_client.schema import EVENTS
 
 from tactomo.events import RateLimit
 from tactomo.stream.access_control import STREAM, Context
@@ -25,7 +25,6 @@ from tactomo.stream.zenoh_bridge import open_session
 from tactomo.stream.zenoh_publication import MAX_SENSORS
 
 LINGER_MS: Final = 200
-MAX_TOPIC_BYTES: Final = 128
 MAX_KEYS: Final = 256
 """Beyond as many, all that there is is subscribed to."""
 
@@ -38,7 +37,6 @@ class ZenohProxy(Relay):
         self._endpoint = endpoint
         self._configuration = configuration
         self._inlet: _Inlet | None = None
-        self._statuses: dict[bytes, tuple[bytes, float]] = {}  # the last of each, and when it came
         self._flood = RateLimit()
 
     def open(self) -> None:
@@ -68,7 +66,6 @@ class ZenohProxy(Relay):
             if self._outlet in ready:
                 self._pass_subscriptions(inlet)
             for message in waiting(inlet.socket) if inlet.socket in ready else ():
-                self._note(message)
                 self._outlet.send(message, zmq.DONTWAIT)
             self._readers.peers.check()
             if time.monotonic() >= look_at_s:
@@ -85,30 +82,15 @@ class ZenohProxy(Relay):
         super().close()
 
     def _pass_subscriptions(self, inlet: _Inlet) -> None:
-        """Ask for what the first one asks for here, and no more for what none does."""
-        before, cuts = set(self._readers.prefixes), self._readers.cuts
+        """Ask for what somebody here asks for; whoever joins gets the last statuses at once."""
+        cuts = self._readers.cuts
         joined = {prefix for joins, prefix in self._readers.changes() if joins}
-        now = set(self._readers.prefixes)
-        inlet.ask(now - before, before - now)
-        # To the first of a prefix Zenoh says again how it is, to the others we do.
-        self._repeat_statuses(joined & before)
+        inlet.ask(set(self._readers.prefixes), joined)
         if self._readers.cuts > cuts and self._flood.allows():
             self._on_event("subscribers_cut", *SUBSCRIBERS_CUT)
 
     def _on_event(self, name: str, detail: str, next_step: str = "", *_: str, **__: str) -> None:
         tell(name, EVENTS[name].severity, detail, next_step)
-
-    def _repeat_statuses(self, prefixes: set[bytes]) -> None:
-        oldest_s = time.monotonic() - STALE_AFTER_S
-        for topic, (message, came_s) in self._statuses.items():
-            if came_s > oldest_s and any(topic.startswith(prefix) for prefix in prefixes):
-                self._outlet.send(message, zmq.DONTWAIT)
-
-    def _note(self, message: bytes) -> None:
-        topic, _, _ = message[:MAX_TOPIC_BYTES].partition(b"\0")
-        is_known = len(self._statuses) < MAX_SENSORS or topic + b"\0" in self._statuses
-        if topic.endswith(f"/{STATUS}".encode()) and is_known:
-            self._statuses[topic + b"\0"] = message, time.monotonic()
 
 
 class _Inlet:
@@ -123,7 +105,6 @@ class _Inlet:
         self.socket.bind("inproc://zenoh")
         self._arriving.connect("inproc://zenoh")
         self._session = session
-        self._prefixes: set[bytes] = set()
         self._subscribers: dict[str, Any] = {}
         self._lock = threading.Lock()  # of what follows, and of `_arriving`
         self._counts: dict[str, int] = {}
@@ -135,10 +116,9 @@ class _Inlet:
             f"{self.address}/*", self._tell_presence, history=True
         )
 
-    def ask(self, more: set[bytes], less: set[bytes]) -> None:
-        """Subscribe to some prefixes, and no more to others; the last status comes at once."""
-        self._prefixes = (self._prefixes | more) - less
-        wanted = {_key(self.address, prefix) for prefix in self._prefixes} - {""}
+    def ask(self, prefixes: set[bytes], anew: set[bytes]) -> None:
+        """Subscribe to these prefixes alone, and ask for the last status of some of them."""
+        wanted = {_key(self.address, prefix) for prefix in prefixes} - {""}
         if len(wanted) > MAX_KEYS:
             wanted = {_key(self.address, b"")}
         if wanted != self._subscribers.keys():
@@ -148,7 +128,7 @@ class _Inlet:
             self._subscribers.pop(key).undeclare()
         for key in wanted - self._subscribers.keys():
             self._subscribers[key] = self._session.declare_subscriber(key, self._take)
-        self._ask_status({_key(self.address, prefix) for prefix in more}, only_news=False)
+        self._ask_status({_key(self.address, prefix) for prefix in anew}, only_news=False)
 
     def ask_news(self) -> None:
         """Ask for each status that somebody wants, as a daemon sends one every second."""
