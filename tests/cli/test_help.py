@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -30,6 +31,7 @@ Run = Callable[..., Any]
 TOP: Any = get_command(app)
 HEAVY = {"numpy", "scipy", "zmq", "pydantic", "aiohttp", "serial", "skfem", "matplotlib", "rich"}
 HEAVY |= {"asyncio", "structlog"}
+GOLDEN = str(Path(__file__).parents[1] / "golden/recording-1.mcap")
 
 
 def leaves(group: Any, path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
@@ -87,6 +89,7 @@ def test_the_daemon_has_no_more_options_than_a_person_types() -> None:
         (["--help"], set()),
         (["status"], set()),
         (["info", "paper_square"], {"numpy", "pydantic", "rich"}),
+        (["info", GOLDEN], {"numpy", "pydantic", "rich", "zmq"}),
         (["ports"], {"serial"}),
         (["status", "--address", "ipc://@nobody"], {"zmq"}),
         (["tare", "--address", "ipc://@nobody"], {"zmq"}),

@@ -882,6 +882,7 @@ def test_a_replay_is_steered_by_the_page(page: Page) -> None:
     wait_until(lambda: page.health == "replay-paused")
     assert page["state"].text == "replay paused"
     assert page["position-text"].text == "2.0 / 40.0 s"
+    assert "scans/s" not in page["channels"].text  # none come, whatever came while it moved
     page["step"].click()
     page["loop"].click()
     page["speed"].find_element(By.XPATH, "./option[text()='0.25']").click()

@@ -23,7 +23,6 @@ from typing import IO, Annotated, Any, Final, NamedTuple
 from urllib.parse import quote
 
 import msgpack  # type: ignore[import-untyped]
-import structlog
 from mcap.records import Chunk as McapChunk
 from mcap.records import Footer, McapRecord, Message, Metadata
 from pydantic import BaseModel, Strict, StrictBool, StrictInt, StrictStr
@@ -52,8 +51,6 @@ PREAMBLE_REACH_NS: Final = 2_000_000_000
 every second, and one of ours is not needed by a port that knows its device."""
 OLD_METHODS: Final = {"hybrid": "auto"}
 """Methods that marks of earlier versions name, and what they are called now."""
-
-log = structlog.get_logger()
 
 
 class Chunk(NamedTuple):
@@ -412,7 +409,9 @@ def recorded_calibration(
     try:
         found = parse_calibration(text, source)
     except CalibrationError as error:
-        log.warning("calibration_unused", detail=str(error))
+        import structlog  # a fifth of the start of `tactomo info`
+
+        structlog.get_logger().warning("calibration_unused", detail=str(error))
         return None
     return None if found.subject.mismatch(found.subject.sensor, description) else found
 

@@ -11,7 +11,6 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri, fdtri  # scipy.stats takes half a second to import
 
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.robust import HUBER_EFFICIENCY, huber_sigma
@@ -87,6 +86,8 @@ def noise_limit(
     freedom: float = np.inf,  # degrees of freedom that their variance is known with
 ) -> float:
     """Sum of squares over their variance that noise alone stays below, but for false alarms."""
+    from scipy.special import chdtri, fdtri  # a third of the start of `tactomo info`
+
     if np.isinf(freedom):
         return float(chdtri(count, FALSE_ALARM))
     return count * float(fdtri(count, freedom, 1 - FALSE_ALARM))

@@ -6,7 +6,6 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtri
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
@@ -157,6 +156,8 @@ def noise_of_scans(scans: FloatArray) -> FloatArray | None:
     """
     if len(scans) < 2:
         return None
+    from scipy.special import chdtri  # a third of the start of `tactomo info`
+
     own, freedom = scans.var(axis=0, ddof=1), len(scans) - 1
     common = float(np.median(own)) * freedom / chdtri(freedom, 0.5)
     share = len(scans) / (len(scans) + TRUSTED_SCANS)

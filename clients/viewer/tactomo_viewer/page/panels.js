@@ -146,7 +146,7 @@ function showChannels({ state, ports, rates, events, companions = {}, issues = [
     const hz = rates?.[`${name}_hz`];
     if (hz === null || hz === undefined) continue;
     lines.push([hz > 0 || stands ? "good" : "bad", name,
-      hz > 0 ? `${fixed(hz, 1)} scans/s` : stands ? state : "no scans"]);
+      stands ? state : hz > 0 ? `${fixed(hz, 1)} scans/s` : "no scans"]);
   }
   for (const [name, { state: does, reading, force_n: force, force_sigma_n: sigma }] of Object.entries(companions)) {
     const kind = { fitted: "good", disputed: "bad", missing: "bad" }[does] ?? "";

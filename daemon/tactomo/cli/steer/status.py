@@ -9,9 +9,7 @@ import typer
 from tactomo.cli import options
 from tactomo.cli.output import print_json, say
 from tactomo.cli.sensors import newest_status
-from tactomo.events import times
 from tactomo.plain import counted, plain
-from tactomo.service.health_issues import FLAG_ADVICE
 
 app = options.typer_app()
 
@@ -139,6 +137,8 @@ def _baseline(baseline: dict[str, Any]) -> str:
 
 
 def _events(events: dict[str, Any]) -> str:
+    from tactomo.events import times
+
     counts = events.get("counts") or {}
     told = (f"{_words(name)} {times(count)}" for name, count in sorted(counts.items()))
     return ", ".join(told) or "none"
@@ -194,6 +194,8 @@ def _misfit(misfit: float | None) -> str:
 
 
 def _flag(name: str) -> str:
+    from tactomo.service.health_issues import FLAG_ADVICE
+
     return f"{name}: {FLAG_ADVICE[name][0]}" if name in FLAG_ADVICE else name
 
 
