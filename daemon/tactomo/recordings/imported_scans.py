@@ -193,9 +193,9 @@ def _of_channel(
 
 def _turned_round(scans: Scans, description: SensorDescription) -> Scans:
     """The scans with plus and minus exchanged in each channel whose voltages have wrong signs."""
-    if description.instrument.voltages != "signed" or not description.runs_round:
+    if description.instrument.voltages != "signed":
         return scans
-    signs = rim_signs(description.pairs, description.electrode_count)
+    signs = rim_signs(description.pairs, description.rim_order)
     wrong = []
     for channel, volts in scans.volts.items():
         known = volts[:: 1 + len(volts) // SIGN_SCANS, signs != 0] * signs[signs != 0]

@@ -28,7 +28,7 @@ import numpy as np
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.robust import robust_sigma
-from tactomo_models.sensor.pattern import Pairs, reciprocal_pairs
+from tactomo_models.sensor.pattern import Pairs, reciprocal_pairs, rim_signs
 
 TINY = float(np.finfo(float).tiny)
 LARGEST = 1e3  # times the largest voltage expected: more is no voltage of this sheet
@@ -102,6 +102,11 @@ class Layout(Protocol):
         """Number of electrodes."""
         ...
 
+    @property
+    def rim_order(self) -> IntArray:
+        """Place of each electrode round the outer rim, from 0, (electrodes,); -1 elsewhere."""
+        ...
+
 
 class Wiring:
     """Which voltages belong together: reciprocal ones, and those of a pair or an electrode."""
@@ -111,7 +116,8 @@ class Wiring:
         self.reciprocal = reciprocal_pairs(pairs)
         ends = np.hstack([pairs.drive, pairs.measure])
         self.electrodes = (ends == np.arange(electrodes)[:, None, None]).any(axis=2)
-        self.ordered = ~_cross(pairs.drive, pairs.measure)
+        # No press turns these voltages round.
+        self.ordered = np.asarray(rim_signs(pairs, layout.rim_order) != 0)
         self.drives = np.array(
             [(pairs.drive == p).all(axis=1) for p in np.unique(pairs.drive, axis=0)]
         )
@@ -133,13 +139,6 @@ class Wiring:
                 return tuple(sorted(faulty))
             faulty.append(worst)
             wrong = wrong & ~touches[worst]
-
-
-def _cross(drive: IntArray, measure: IntArray) -> BoolArray:
-    """Tell whether the chords of two pairs cross: one electrode lies between the others."""
-    low, high = drive.min(axis=1), drive.max(axis=1)
-    between = (low[:, None] < measure) & (measure < high[:, None])
-    return np.asarray(between[:, 0] != between[:, 1])
 
 
 class ScanCheck:

@@ -331,15 +331,17 @@ class SensorDescription(Section):
         return np.asarray(self.electrode_ends_m.mean(axis=1))
 
     @cached_property
-    def runs_round(self) -> bool:
-        """Whether the electrodes' numbers go once round the outer rim, either way."""
-        placed = self.placed_electrodes
-        rim = [e.middle_m for e in placed if isinstance(e, RimElectrode) and e.ring == 0]
-        if len(rim) < len(placed):
-            return False
-        along = np.mod(rim, self.sheet.outline.lengths_m[0])
-        rises = np.sum(np.diff(np.append(along, along[0])) > 0)
-        return bool(rises in (1, len(along) - 1))
+    def rim_order(self) -> IntArray:
+        """Place of each electrode round the outer rim, from 0, (electrodes,); -1 elsewhere."""
+        length_m = self.sheet.outline.lengths_m[0]
+        along = {
+            number: each.middle_m % length_m
+            for number, each in enumerate(self.placed_electrodes)
+            if isinstance(each, RimElectrode) and each.ring == 0
+        }
+        order = np.full(self.electrode_count, -1)
+        order[sorted(along, key=along.__getitem__)] = np.arange(len(along))
+        return order
 
     @cached_property
     def off_sheet(self) -> BoolArray | None:

@@ -44,16 +44,18 @@ def touching(drive: IntArray, measure: IntArray) -> BoolArray:
     return np.asarray((drive[:, :, None] == measure[:, None, :]).any(axis=(1, 2)))
 
 
-def rim_signs(pairs: Pairs, electrodes: int) -> IntArray:
-    """Signs (M,) of a bare sheet's voltages, 0 where drive and measuring pair cross.
+def rim_signs(pairs: Pairs, rim_order: IntArray) -> IntArray:
+    """Signs (M,) of a sheet's voltages, 0 where pairs cross or an electrode is off the outer rim.
 
     Potential falls along the rim from the source to the sink, whichever way one goes.
     """
-    source, sink, plus, minus = np.hstack([pairs.drive, pairs.measure]).T
-    sink, plus, minus = ((end - source) % electrodes for end in (sink, plus, minus))
+    ends = rim_order[np.hstack([pairs.drive, pairs.measure])]
+    source, *others = ends.T
+    sink, plus, minus = ((end - source) % (rim_order.max() + 1) for end in others)
     one_way = (plus <= sink) & (minus <= sink)
     other_way = (plus >= sink) & (minus >= sink)
-    return np.asarray(np.sign(minus - plus) * (one_way.astype(int) - other_way))
+    signs = np.sign(minus - plus) * (one_way.astype(int) - other_way)
+    return np.where((ends >= 0).all(axis=1), signs, 0)
 
 
 def scan_positions(pairs: Pairs) -> dict[tuple[int, ...], int]:
@@ -75,6 +77,11 @@ class PatternLayout:
 
     pairs: Pairs
     electrode_count: int
+
+    @property
+    def rim_order(self) -> IntArray:
+        """The electrodes are numbered round the rim."""
+        return np.arange(self.electrode_count)
 
 
 def pattern_of_zeros(scans: FloatArray) -> PatternLayout:

@@ -150,7 +150,9 @@ def test_electrodes_go_round_corners_and_holes() -> None:
     (before, after), (left, right) = corner.electrode_ends_m[:2].round(9).tolist()
     assert (before, after) == ([0.05, 0.047], [0.047, 0.05])
     assert sorted([left, right]) == [[-0.003, -0.01], [0.003, -0.01]]
-    assert not corner.runs_round
+    assert corner.rim_order[1] == -1
+    on_rim = np.delete(corner.rim_order, 1)
+    assert ((on_rim - on_rim[1]) % 7).tolist() == [3, 0, 1, 2, 4, 5, 6]
     assert not corner.on_sheet(np.array([0.0]), np.array([0.0])).any()
 
 
@@ -172,7 +174,7 @@ def test_uneven_electrodes_on_a_rectangle_and_a_disc(paper: SensorDescription) -
     listed = {"length_m": 0.006, "contact_impedance_ohm_m": 10.0, "positions_m": places}
     uneven = variant(paper, electrodes={**listed, "per_side": None, "pitch_m": None})
     np.testing.assert_allclose(uneven.electrode_centres_m, places, atol=1e-12)
-    assert uneven.runs_round
+    assert set(np.diff(uneven.rim_order) % 6) == {1}
     raw = load_description("tank_disc").model_dump(by_alias=True, exclude_none=True)
     raw["electrodes"] = {
         **listed,
