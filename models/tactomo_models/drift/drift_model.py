@@ -132,13 +132,9 @@ class PressMemory:
         }
         self._cell_of_map = subspace.cell_of_map.ravel()
         self._sigma = np.zeros(subspace.modes.shape[1])
-        self._cells = subspace.cells
+        self._cells, self._number = subspace.cells, CELLS**2
         self._count = np.maximum(np.bincount(self._cell_of_map, minlength=self._number), 1)
         self.clear()
-
-    @property
-    def _number(self) -> int:
-        return int(self._cells.stop - self._cells.start)
 
     def clear(self) -> None:
         """Forget all."""

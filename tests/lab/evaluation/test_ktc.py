@@ -11,8 +11,12 @@ import numpy as np
 import pytest
 from challenge_tanks import FINE_RINGS, challenge_pattern, simulated_tank
 from shared_data import measured
-from tactomo_lab.evaluation.ktc import evaluate_challenge, read_challenge
-from tactomo_lab.tanks.challenge import every_reading, kept_readings
+from tactomo_lab.evaluation.ktc import (
+    evaluate_challenge,
+    every_reading,
+    kept_readings,
+    read_challenge,
+)
 from tactomo_lab.tanks.model import TankModel
 from tactomo_models import DataError, load_description
 from tactomo_models.arrays import FloatArray

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from challenge_tanks import challenge_pattern
+from tactomo_lab.evaluation.ktc import score
 from tactomo_lab.tanks import fit as fitting
-from tactomo_lab.tanks.challenge import score
 from tactomo_lab.tanks.fit import TankFit
 from tactomo_lab.tanks.images import pixel_grid
 from tactomo_lab.tanks.model import Readings, TankModel

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from challenge_tanks import challenge_pattern
-from tactomo_lab.tanks.challenge import kept_readings
+from tactomo_lab.evaluation.ktc import kept_readings
 from tactomo_lab.tanks.model import Readings, TankModel
 from tactomo_models import load_description
 from taylor import taylor_orders

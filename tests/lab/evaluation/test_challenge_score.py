@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from challenge_tanks import challenge_pattern
 from scipy.signal import fftconvolve
-from tactomo_lab.tanks.challenge import kept_readings, score
+from tactomo_lab.evaluation.ktc import kept_readings, score
 from tactomo_models.arrays import FloatArray
 
 
