@@ -245,7 +245,7 @@ def _check_frame(xy_mm: FloatArray, guess_mm: FloatArray, description: SensorDes
             "x to the right and y up from the middle, seen from the pressed side, in mm"
         )
     _check_order(xy_mm, guess_mm)
-    outside = np.flatnonzero((np.abs(xy_mm) > size_mm / 2).any(axis=1))
+    outside = np.flatnonzero(~description.on_sheet(*1e-3 * xy_mm.T))
     if len(outside):
         place = ", ".join(f"{each:.1f}" for each in xy_mm[outside[0]])
         raise CalibrationError(
