@@ -286,8 +286,8 @@ def _in_phase(
     quadrature = _quadrature(raw)
     if quadrature > MAX_QUADRATURE:
         raise ImportFileError(
-            f"{path}: {quadrature:.0%} of the signal is out of phase with the current, by whatever "
-            "angle all of it is turned",
+            f"{path}: the voltages have no common phase: {quadrature:.0%} of the signal stays "
+            "out of phase with the current at the best rotation",
             "calibrate the instrument by a resistor, and measure again",
         )
     notes += (f"real part taken; {quadrature:.0%} is quadrature",)
