@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
+from xml.etree.ElementTree import Element, iterparse
 
 import numpy as np
 import shapely
@@ -20,13 +21,19 @@ from tactomo_models.errors import DataError
 from tactomo_models.foreign_file import read_regular
 from tactomo_models.imported.model import Model, no_unit
 
-MAX_BYTES: Final = 20_000_000
+MAX_BYTES: Final = 5_000_000
+MAX_PARTS: Final = 20_000
+"""Lines, blocks and groups, as often as they are drawn: a kilobyte may draw one a billion times."""
+MAX_POINTS: Final = 200_000
+MAX_PATH_BYTES: Final = 100_000  # of SVG, whose reader is slow
 MAX_LINES: Final = 5_000
 FLAT_MM: Final = 0.02  # curves become straight lines that are so near
+FLAT_SHARE: Final = 1e-6  # of a line's size, likewise: nobody's sheet is that large
 JOIN_MM: Final = 0.05  # ends so near are one corner
 POINTS: Final = 33  # of a curve of SVG
 NO_LINE: Final = {"TEXT", "MTEXT", "ATTDEF", "DIMENSION", "LEADER", "MULTILEADER", "HATCH", "IMAGE"}
 PHYSICAL: Final = re.compile(r"\s*[\d.eE+-]+\s*(mm|cm|in|pt|pc|q)\s*$", re.IGNORECASE)
+HREF: Final = "{http://www.w3.org/1999/xlink}href"
 LABEL: Final = "{http://www.inkscape.org/namespaces/inkscape}label"
 
 
@@ -56,7 +63,7 @@ def read_drawing(
     read = _dxf if path.suffix.lower() == ".dxf" else _svg
     content = read_regular(path, MAX_BYTES)
     try:
-        lines = list(read(content, unit_mm))
+        lines = list(_bounded(read(content, unit_mm)))
     except (ImportError, DataError):
         raise
     except Exception as error:  # parsers raise almost anything
@@ -78,6 +85,39 @@ def read_drawing(
     return Model(polygon, centres, sizes, 1.0)
 
 
+def _bounded(lines: Iterator[Line]) -> Iterator[Line]:
+    points = 0
+    for number, line in enumerate(lines):
+        points += len(line.points)
+        if number == MAX_PARTS or points > MAX_POINTS:
+            raise _too_much()
+        yield line
+
+
+def _too_much() -> DataError:
+    return DataError(
+        f"the drawing has more than {MAX_PARTS} parts, {MAX_POINTS} points or {MAX_PATH_BYTES} "
+        "bytes of paths; save the sheet's outline and electrodes alone"
+    )
+
+
+def _check_count(root: Any, below: Callable[[Any], Iterable[tuple[int, Any]]]) -> None:
+    """Raise DataError where a drawing has too many parts, each counted as often as it is drawn.
+
+    `below` gives what a part draws, and how often; what draws itself is left to the parser.
+    """
+    counted: dict[int, int] = {}
+
+    def count(part: Any) -> int:
+        if id(part) not in counted:
+            counted[id(part)] = 0
+            counted[id(part)] = 1 + sum(often * count(each) for often, each in below(part))
+        return counted[id(part)]
+
+    if count(root) > MAX_PARTS:
+        raise _too_much()
+
+
 def _dxf(content: bytes, unit_mm: float | None) -> Iterator[Line]:
     from ezdxf import disassemble, path, recover, units
     from ezdxf.enums import InsertUnits
@@ -87,6 +127,18 @@ def _dxf(content: bytes, unit_mm: float | None) -> Iterator[Line]:
         if not document.units:
             raise no_unit("the drawing", "$INSUNITS is 0")
         unit_mm = units.conversion_factor(InsertUnits(document.units), InsertUnits.Millimeters)
+    blocks = document.blocks
+
+    def below(part: Any) -> Iterator[tuple[int, Any]]:
+        if not hasattr(part, "dxftype"):  # a layout
+            yield from ((1, entity) for entity in part)
+            return
+        key = "name" if part.dxftype() == "INSERT" else "geometry"  # of a dimension
+        name = part.dxf.get(key) if part.dxf.is_supported(key) else None
+        if name and name in blocks:
+            yield getattr(part, "mcount", 1), blocks.get(name)
+
+    _check_count(document.modelspace(), below)
     for entity in document.modelspace():
         if entity.dxftype() in NO_LINE:
             continue
@@ -100,13 +152,16 @@ def _dxf(content: bytes, unit_mm: float | None) -> Iterator[Line]:
             except TypeError:  # no line, such as a text of a block
                 continue
             for sub in drawn.sub_paths():
-                points = np.array([(p.x, p.y) for p in sub.flattening(FLAT_MM / unit_mm)])
+                size = np.ptp([tuple(point) for point in sub.control_vertices()], axis=0).max()
+                flat = max(FLAT_MM / unit_mm, FLAT_SHARE * size)
+                points = np.array([(p.x, p.y) for p in sub.flattening(flat)])
                 yield Line(layer, unit_mm * points)
 
 
 def _svg(content: bytes, unit_mm: float | None) -> Iterator[Line]:
     import svgelements
 
+    _check_svg(content)
     drawing = svgelements.SVG.parse(io.BytesIO(content), reify=True, ppi=96)
     if unit_mm is not None:  # of the drawing's own coordinates, which a view box scales
         own = drawing.viewbox.width if drawing.viewbox is not None else None
@@ -127,6 +182,27 @@ def _svg(content: bytes, unit_mm: float | None) -> Iterator[Line]:
                     yield Line(inside, scale * np.concatenate([np.zeros((0, 2)), *points]))
 
     yield from walk(drawing, ())
+
+
+def _check_svg(content: bytes) -> None:
+    """Raise DataError where an SVG file draws too much, before anything of it is drawn."""
+    held: dict[str, Element] = {}
+    elements: list[Element] = []
+    path_bytes = 0
+    for _, element in iterparse(io.BytesIO(content), ("start",)):
+        elements.append(element)
+        path_bytes += len(element.get("d", ""))
+        if len(elements) > MAX_PARTS or path_bytes > MAX_PATH_BYTES:
+            raise _too_much()
+        held[f"#{element.get('id')}"] = element
+
+    def below(part: Element) -> Iterator[tuple[int, Element]]:
+        yield from ((1, each) for each in part)
+        used = held.get(part.get(HREF, part.get("href", "")))
+        if part.tag.endswith("use") and used is not None:
+            yield 1, used
+
+    _check_count(elements[0], below)
 
 
 def _along(segment: Any) -> FloatArray:

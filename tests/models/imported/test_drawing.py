@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -96,3 +97,75 @@ def test_a_drawing_that_shows_no_sheet_is_refused_with_what_to_do(tmp_path: Path
     path.write_text("<svg><polygon points=")
     with pytest.raises(DataError, match="as SVG"):
         described(path)
+
+
+def nested_dxf(path: Path, depth: int = 9) -> None:
+    """Blocks of ten blocks each, of one square in the end."""
+    document = new(units=4)
+    document.blocks.new("0-").add_lwpolyline([(0, 0), (9, 0), (9, 9), (0, 9)], close=True)
+    for level in range(1, depth):
+        block = document.blocks.new(f"{level}-")
+        for place in range(10):
+            block.add_blockref(f"{level - 1}-", (place, 0))
+    document.modelspace().add_blockref(f"{depth - 1}-", (0, 0))
+    document.saveas(path)
+
+
+def gridded_dxf(path: Path) -> None:
+    """One square, in so many rows and columns."""
+    document = new(units=4)
+    document.blocks.new("0-").add_lwpolyline([(0, 0), (9, 0), (9, 9), (0, 9)], close=True)
+    grid = {"row_count": 30_000, "column_count": 30_000, "row_spacing": 1, "column_spacing": 1}
+    document.modelspace().add_blockref("0-", (0, 0), dxfattribs=grid)
+    document.saveas(path)
+
+
+def wide_dxf(path: Path) -> None:
+    """A circle of millions of corners, if each is to be near it."""
+    document = new(units=4)
+    document.modelspace().add_circle((0, 0), 1e12)
+    document.saveas(path)
+
+
+def nested_svg(path: Path, depth: int = 9) -> None:
+    """Groups that use a group ten times each."""
+    groups = '<g id="0"><rect width="9" height="9"/></g>'
+    for level in range(1, depth):
+        groups += f'<g id="{level}">' + f'<use href="#{level - 1}"/>' * 10 + "</g>"
+    path.write_text(
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="9mm" height="9mm"><defs>{groups}</defs>'
+        f'<use href="#{depth - 1}"/></svg>'
+    )
+
+
+def long_svg(path: Path) -> None:
+    """A path without end."""
+    path.write_text(
+        '<svg xmlns="http://www.w3.org/2000/svg" width="9mm" height="9mm"><path d="M0 0'
+        + " C1 1 2 2 3 3" * 300_000
+        + '"/></svg>'
+    )
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        ("nested.dxf", nested_dxf),
+        ("grid.dxf", gridded_dxf),
+        ("nested.svg", nested_svg),
+        ("long.svg", long_svg),
+    ],
+)
+def test_a_small_file_that_draws_without_end_is_refused(
+    tmp_path: Path, name: str, write: Callable[[Path], None]
+) -> None:
+    write(tmp_path / name)
+    with pytest.raises(DataError, match="parts"):
+        read_drawing(tmp_path / name, "electrodes")
+
+
+def test_a_huge_circle_has_few_corners(tmp_path: Path) -> None:
+    wide_dxf(tmp_path / "wide.dxf")
+    model = read_drawing(tmp_path / "wide.dxf", "electrodes")
+    assert len(model.polygon.exterior.coords) < 10_000
