@@ -118,6 +118,7 @@ class Wiring:
         self.electrodes = (ends == np.arange(electrodes)[:, None, None]).any(axis=2)
         # No press turns these voltages round.
         self.ordered = np.asarray(rim_signs(pairs, layout.rim_order) != 0)
+        self.off_rim = np.asarray((layout.rim_order[ends] < 0).any(axis=1))
         self.drives = np.array(
             [(pairs.drive == p).all(axis=1) for p in np.unique(pairs.drive, axis=0)]
         )

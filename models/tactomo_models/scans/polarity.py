@@ -30,9 +30,11 @@ class Polarity:
         kind = description.instrument.voltages
         self._are_told = kind == "signed"
         self._model = np.sign(predicted)
-        # (M,) readings whose sign is known; all of them where the device tells it, and the half
-        # that it reads where it reads but one sign
-        self.certain = wiring.ordered | (np.abs(predicted) > least) | self._are_told
+        # (M,) readings whose sign is known; all between rim electrodes where the device tells it,
+        # and the half that it reads where it reads but one sign. Off the rim, one may be next
+        # to nothing at rest, against which no change can be measured.
+        told = self._are_told & ~wiring.off_rim
+        self.certain = wiring.ordered | (np.abs(predicted) > least) | told
         if kind in ("positive", "negative"):
             self.certain &= self._model == (1.0 if kind == "positive" else -1.0)
 
