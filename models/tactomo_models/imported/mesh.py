@@ -59,11 +59,24 @@ def read_model(path: Path, unit_mm: float | None = None) -> Model:
             raise DataError(f"{path}: its triangles are not one sheet; describe each as its own")
         extents = [nodes[each, :2] for each in electrodes]
         sizes = np.array([np.hypot(*np.ptp(each, axis=0)) for each in extents])
+        holes = []
+        for hole in map(shapely.Polygon, polygon.interiors):
+            round_it = [n for n, each in enumerate(extents) if _surrounds(each, hole)]
+            sizes[round_it] = 2 * np.sqrt(hole.area / np.pi)  # an electrode inside: a pad
+            holes += [] if round_it else [hole.exterior]
+        polygon = shapely.Polygon(polygon.exterior, holes)
         centres = np.array([each.mean(axis=0) for each in extents]).reshape(-1, 2)
         pattern = _pattern(path, drives, len(electrodes), current_a) if drives else None
     except (IndexError, KeyError, TypeError, ValueError) as error:
         raise DataError(f"{path}: no model that can be read ({error}); {NEXT}") from error
     return Model(polygon, centres, sizes, unit_mm, pattern)
+
+
+def _surrounds(nodes: FloatArray, hole: shapely.Polygon) -> bool:
+    """Whether an electrode's nodes (n, 2) lie all round a hole, as EIDORS meshes one inside."""
+    return bool(shapely.MultiPoint(nodes).convex_hull.area > 0.9 * hole.area) and bool(
+        np.all(shapely.distance(hole.exterior, shapely.points(nodes)) < 1e-6 * hole.length)
+    )
 
 
 def _pyeit_drives(held: Arrays) -> Drives:

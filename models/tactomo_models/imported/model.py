@@ -103,7 +103,11 @@ def describe(
             "",
             "[electrodes]                      # 0 first: lead 0 of the device",
             f"length_m = {1e-3 * length_mm:.6g}",
-            *([f"pad_radius_m = {5e-4 * length_mm:.6g}"] if deep.any() else []),
+            *(
+                [f"pad_radius_m = {5e-4 * (electrode_mm or np.median(lengths_mm[deep])):.6g}"]
+                if deep.any()
+                else []
+            ),
             "contact_impedance_ohm_m = 10.0    # per metre of electrode: a guess",
             *_rows("positions_m", places),
             "",

@@ -17,6 +17,7 @@ from tactomo_models.imported.model import describe
 from tactomo_models.physics.bare_sheet import solve_bare_sheet
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import mesh_sheet
+from tactomo_models.sensor.outline import Pad
 
 RADIUS_MM = 140
 
@@ -57,21 +58,31 @@ def test_a_pyeit_model_gives_pyeits_voltages_and_is_not_mirrored(
     assert np.corrcoef(*differences)[0, 1] > 0.98
 
 
-def eidors(path: Path, disc: Any, rotated: bool = False) -> Path:
-    """Save as EIDORS has it: electrodes clockwise from the top, of several nodes, sparse rows."""
-    ring = np.arange(16)
-    electrode = np.zeros((1, 16), [("nodes", object), ("z_contact", object)])
-    stimulation = np.zeros((1, 16), [("stim_pattern", object), ("meas_pattern", object)])
+def eidors(path: Path, disc: Any, rotated: bool = False, hole: Any = None) -> Path:
+    """Save as EIDORS has it: electrodes clockwise from the top, of several nodes, sparse rows.
+
+    Another one is round a hole, where one is given: the elements (n,) that are cut out.
+    """
+    count, elements = 16, disc.element
+    if hole is not None:
+        count, elements = 17, disc.element[~hole]
+    ring = np.arange(count)
+    electrode = np.zeros((1, count), [("nodes", object), ("z_contact", object)])
+    stimulation = np.zeros((1, count), [("stim_pattern", object), ("meas_pattern", object)])
     angle = np.arctan2(disc.node[:, 1], disc.node[:, 0])
     on_rim = np.abs(np.hypot(*disc.node[:, :2].T) - 1) < 1e-6
     for k in range(16):
         off = np.angle(np.exp(1j * (angle - np.pi / 2 + 2 * np.pi * k / 16)))
         electrode[0, k] = np.flatnonzero(on_rim & (np.abs(off) < 0.11))[None] + 1.0, 0.01
-        pairs = np.eye(16)[(ring + 1) % 16] - np.eye(16)  # plus k + 1, minus k
+    if hole is not None:
+        round_it = np.intersect1d(disc.element[hole], elements)
+        electrode[0, 16] = round_it[None] + 1.0, 0.01
+    for k in range(count):
+        pairs = np.eye(count)[(ring + 1) % count] - np.eye(count)  # plus k + 1, minus k
         rows = pairs[(np.abs(pairs) * np.abs(pairs[k])).sum(axis=1) == 0]
         current = csc_array(0.01 * pairs[k][:, None])
         stimulation[0, k] = current, csc_array(np.roll(rows, -k if rotated else 0, axis=0))
-    model = {"nodes": disc.node[:, :2], "elems": disc.element + 1.0, "type": "fwd_model"}
+    model = {"nodes": disc.node[:, :2], "elems": elements + 1.0, "type": "fwd_model"}
     savemat(path, {"fmdl": model | {"electrode": electrode, "stimulation": stimulation}})
     return path
 
@@ -88,6 +99,18 @@ def test_an_eidors_model_has_its_electrodes_and_its_pattern(tmp_path: Path, disc
     assert sensor.measurements == 208
     assert sensor.offsets == (1, 1)
     assert sensor.pattern.current_a == 0.01
+
+
+def test_an_electrode_round_a_hole_becomes_a_pad(tmp_path: Path, disc: Any) -> None:
+    middles = disc.node[disc.element, :2].mean(axis=1)
+    hole = np.hypot(*(middles - [0.3, 0.2]).T) < 0.15
+    sensor = described(eidors(tmp_path / "fmdl.mat", disc, hole=hole))
+    assert (sensor.sheet.shape, sensor.sheet.holes_m) == ("disc", ())
+    assert sensor.electrode_count == 17
+    pad = sensor.placed_electrodes[16]
+    assert isinstance(pad, Pad)
+    assert pad.centre_m == pytest.approx((0.3 * 0.14, 0.2 * 0.14), abs=0.006)
+    assert pad.radius_m == pytest.approx(0.15 * 0.14, rel=0.2)
 
 
 def test_voltages_in_another_order_are_told(tmp_path: Path, disc: Any) -> None:
