@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Final
 
 from rich import console
 from rich.segment import Segment
 
 from tactomo.plain import plain
+
+PAGE_WIDTH: Final = 150  # columns that the widest table takes
 
 
 class Console(console.Console):
@@ -27,3 +29,9 @@ class Console(console.Console):
         for segment in super().render(renderable, options):
             is_ours = segment.control is not None
             yield segment if is_ours else Segment(plain(segment.text), segment.style)
+
+
+def page() -> Console:
+    """The terminal; where there is none, a page as wide as tables are: a file has no width."""
+    shown = Console()
+    return shown if shown.is_terminal else Console(width=PAGE_WIDTH)

@@ -51,9 +51,9 @@ def tell(
     if as_json:
         print_json(told)
     else:
-        from tactomo.cli.console import Console
+        from tactomo.cli.console import page
 
-        show(Console())
+        show(page())
     if picture is not None and draw is not None:
         draw(picture)
         say(f"wrote {picture}", err=True)

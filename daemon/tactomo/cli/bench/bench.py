@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from tactomo.cli.console import Console
 
 SENSOR = "bench"
-PAGE_WIDTH = 150
 SETTLE_S = 1.5
 STATUS_S = 13.0  # at 20 dual scans a second: as far back as the stage times in a status go
 START_S = 60.0
@@ -258,11 +257,9 @@ def _print(results: Results) -> None:
 
 def _console(results: Results) -> Console:
     """Return where to print, and say there on what everything was measured."""
-    from tactomo.cli.console import Console
+    from tactomo.cli.console import page
 
-    console = Console()
-    if not console.is_terminal:  # a file has no width of its own, and the table needs one
-        console = Console(width=PAGE_WIDTH)
+    console = page()
     console.print(f"{results.machine}, sensor {results.description}")
     return console
 
