@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import sys
+from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,11 +82,6 @@ def read_load_cell(
     """
     table = _Table(path)
     clock = next((name for name in CLOCKS if name in table.columns), "")
-    if not clock and "magnitude" not in table.columns:
-        raise CalibrationError(
-            f"{path} has no column magnitude, and no {' or '.join(CLOCKS)} by which to find it in "
-            f"a recording; it has: {', '.join(table.columns)}"
-        )
     pressure = table.pressures_kpa(area_mm2)
     indenter_mm2 = table.areas_mm2(area_mm2)
     times_s = table.numbers(clock) if clock else table.unknown
@@ -192,7 +188,7 @@ class _Table:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.lines: list[int] = []  # the number of each row's line
+        self.lines = array("q")  # the number of each row's line
         self.columns: list[str] = []  # their names
         cells_of: list[list[str]] = []  # each column
         delimiter = ""
@@ -213,6 +209,11 @@ class _Table:
                     column.append(sys.intern(cell.strip()))  # logs say the same again and again
             else:
                 self.columns = [cell.strip().lower() for cell in cells]
+                if not {"magnitude", *CLOCKS} & set(self.columns):
+                    raise CalibrationError(
+                        f"{path} has no column magnitude, and no {' or '.join(CLOCKS)} by which to "
+                        f"find it in a recording; it has: {', '.join(self.columns)}"
+                    )
                 cells_of = [[] for _ in cells]
         if not self.lines:
             raise CalibrationError(

@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -94,22 +94,35 @@ def daemon(*arguments: str, **environment: str) -> subprocess.Popen[str]:
 
 
 @pytest.mark.slow
-def test_under_journald_a_failure_to_start_is_an_error(tmp_path: Path) -> None:
-    with daemon("--port", str(tmp_path / "none")) as process:
+def test_under_journald_a_failure_to_start_is_an_error(
+    tmp_path: Path, make_skin: Callable[[Path, int], Any], used_port: int
+) -> None:
+    metrics = f"metrics=127.0.0.1:{used_port}"
+    with daemon("--port", str(make_skin(tmp_path, 1).lines[0].path), "--set", metrics) as process:
         assert process.stderr is not None
         said = process.stderr.read()
     assert process.returncode == 1
     assert "<6>loading sensor_model=paper_square" in said
-    assert re.search(r"^<3>tactomo: .*none", said, re.M)
+    assert re.search(rf"^<3>tactomo: .*{used_port}", said, re.M)
 
 
 @pytest.mark.slow
-def test_elsewhere_it_stays_json(tmp_path: Path) -> None:
-    with daemon("--port", str(tmp_path / "none"), JOURNAL_STREAM="8:1") as process:
+def test_elsewhere_it_stays_json(
+    tmp_path: Path, make_skin: Callable[[Path, int], Any], used_port: int
+) -> None:
+    port, metrics = str(make_skin(tmp_path, 1).lines[0].path), f"metrics=127.0.0.1:{used_port}"
+    with daemon("--port", port, "--set", metrics, JOURNAL_STREAM="8:1") as process:
         assert process.stderr is not None
         said = process.stderr.read()
     assert '"event": "loading"' in said
     assert "<3>" not in said
+
+
+@pytest.fixture
+def used_port() -> Iterator[int]:
+    """A TCP port of this computer that somebody listens at."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield int(server.getsockname()[1])
 
 
 @pytest.mark.slow

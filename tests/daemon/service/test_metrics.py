@@ -135,10 +135,11 @@ def test_an_address_that_nothing_guards_is_refused(address: str, says: str) -> N
 
 
 @pytest.mark.slow
-def test_a_missing_library_is_named(tmp_path: Path) -> None:
+def test_a_missing_library_is_named(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> None:
+    port = make_skin(tmp_path, 1).lines[0].path
     program = (
         "import sys; sys.modules['prometheus_client'] = None; from tactomo.cli import main; "
-        f"sys.argv = 'tactomo daemon -p {tmp_path}/none --set metrics={ANYWHERE}'.split(); "
+        f"sys.argv = 'tactomo daemon -p {port} --set metrics={ANYWHERE}'.split(); "
         "main()"
     )
     done = subprocess.run(

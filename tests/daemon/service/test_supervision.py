@@ -135,7 +135,7 @@ def test_a_pipeline_that_hangs_is_not_hidden_by_the_threads_that_do_not(
     assert process.popen.wait(PATIENCE_S) == -signal.SIGABRT
     log = process.log_path.read_text()
     assert '"threads": ["pipeline"' in log  # and whoever else a busy computer held up
-    assert "in reconstruct" in log, "where it hangs is in the log"
+    assert "in compare" in log, "where it hangs is in the log"
 
 
 @pytest.mark.slow

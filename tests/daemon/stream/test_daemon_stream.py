@@ -181,13 +181,13 @@ def test_a_reconstruction_that_fails_costs_its_frame_alone(
     b = bench()
     b.tare()
     memory = b.daemon._imaging._reconstructor
-    reconstruct = memory.reconstruct
+    solve = memory.solve
 
     def fail_once(*_: Any, **__: Any) -> Any:
-        memory.reconstruct = reconstruct
+        memory.solve = solve
         raise ZeroDivisionError("a mistake")
 
-    memory.reconstruct = fail_once
+    memory.solve = fail_once
     b.skin.scan()
     assert "ZeroDivisionError" in b.listener.event("reconstruction_failed")["detail"]
     assert b.step(load=0.1)["map"] is not None

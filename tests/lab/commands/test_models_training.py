@@ -16,7 +16,7 @@ Run = Callable[..., Any]
     ("arguments", "package"),
     [
         (("simulate", "scenes", "--description", "paper_square"), "joblib"),
-        (("train", "scenes"), "torch"),
+        (("train", "scenes"), "onnx"),  # and torch
     ],
 )
 def test_a_missing_extra_is_told(

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
+from tactomo_models.sensor.sheet import MAX_SHEET_M
 
 ROUNDING = 1e-9
 
@@ -99,7 +100,7 @@ def test_a_rectangle_of_any_geometry(
     spread *= 1 - 1e-12  # the sum that the description checks may round up
     share = max(share, 20e-6 * per_side / (spread * width * min(aspect, 1)))  # none below 10 um
     assume((nodes + 2) / (nodes - 1) < 4 * aspect)  # else map nodes are too far apart one way
-    description = rectangle(width, min(width * aspect, 10.0), per_side, spread, share, nodes)
+    description = rectangle(width, min(width * aspect, MAX_SHEET_M), per_side, spread, share, nodes)
     areas = triangle_areas(check(description))
     assert areas.sum() == pytest.approx(description.width_m * description.height_m, rel=ROUNDING)
 
