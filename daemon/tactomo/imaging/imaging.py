@@ -298,11 +298,11 @@ class Imaging:
         """
         if self._took_s is None:
             return
-        processor, before = self._processor, self._processor.of_time
+        processor, before = self._processor, self._processor.of_work
         if not processor.note(*self._took_s, dropped, time.monotonic()):
             return
-        self.method.give_share(processor.of_time)
-        share = processor.of_time
+        self.method.give_share(processor.of_work)
+        share = processor.of_work
         if share < before:
             self._on_event(
                 "processor_shared",

@@ -32,8 +32,8 @@ class ProcessorShare:
 
     def __init__(self) -> None:
         # the share of a core that the thread got of late while it computed; and the share of its
-        # time that a frame is left: 1, 1/2, ... LEAST
-        self.of_core = self.of_time = 1.0
+        # work that a frame is left: 1, 1/2, ... LEAST
+        self.of_core = self.of_work = 1.0
         self._cpu_s = self._wall_s = 0.0
         self._dropped = self._frames = 0
         self._noted_s = self._looked_s = self._changed_s = self._raised_s = float("-inf")
@@ -46,7 +46,7 @@ class ProcessorShare:
         dropped: int,  # dual scans left out since the start
         now_s: float,  # monotonic seconds
     ) -> bool:
-        """Take note of a frame in which something presses; return whether `of_time` has changed."""
+        """Take note of a frame in which something presses; return whether `of_work` has changed."""
         if now_s - self._noted_s > LOOK_S:  # what was left out while nothing pressed
             self._dropped, self._frames, self._looked_s = dropped, 0, now_s
         self._noted_s = now_s
@@ -58,14 +58,14 @@ class ProcessorShare:
             return False
         is_late = dropped - self._dropped > MANY * self._frames
         self._dropped, self._frames, self._looked_s = dropped, 0, now_s
-        before = self.of_time
+        before = self.of_work
         if is_late and self.of_core < TAKEN:
-            self.of_time = max(LEAST, before / 2)
+            self.of_work = max(LEAST, before / 2)
             if now_s - self._raised_s < 2 * self._hold_s:
                 self._hold_s, self._raised_s = min(2 * self._hold_s, MAX_HOLD_S), float("-inf")
         elif before < 1 and not is_late and now_s - self._changed_s > self._hold_s:
-            self.of_time = min(1.0, 2 * before)
+            self.of_work = min(1.0, 2 * before)
             self._raised_s = now_s
-        if self.of_time != before:
+        if self.of_work != before:
             self._changed_s = now_s
-        return self.of_time != before
+        return self.of_work != before

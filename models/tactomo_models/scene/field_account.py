@@ -244,8 +244,9 @@ class FieldAccountant:
             of_peaks = family.unit_kpa * np.array([0.0, *(one.sigmas[PEAK] for one in likely)])
             slopes = np.array([one.slope for one in alone])
             # Whatever else it may be has a peak of its own uncertainty.
-            own_sigmas = np.hypot(contacts.peak_magnitude_sigma[at], slopes * of_peaks)
-            more = float(share @ (slopes * of_peaks) ** 2)
+            by_peak = slopes * of_peaks
+            more = float(share @ by_peak**2)
+            own_sigmas = np.hypot(contacts.peak_magnitude_sigma[at], by_peak)
             peaks = np.array([one.peak_magnitude for one in alone])
             sides = contacts.peak_magnitude_sides.copy()
             sides[:, at] = _sides(share, peaks, own_sigmas)

@@ -22,7 +22,7 @@ class Computer:
             self.now_s += FRAME_S
             self.dropped += drops
             if self.share.note(of_core * FRAME_S, FRAME_S, self.dropped, self.now_s):
-                given.append(self.share.of_time)
+                given.append(self.share.of_work)
         return given
 
 
@@ -53,7 +53,7 @@ def test_what_was_too_much_is_tried_less_and_less_often() -> None:
     computer = Computer()
     tries = 0
     for _ in range(120):  # seconds: half of the time is kept, all of it is too much
-        tries += computer.run(0.4, 1.0, drops=computer.share.of_time == 1).count(1.0)
+        tries += computer.run(0.4, 1.0, drops=computer.share.of_work == 1).count(1.0)
     assert 3 <= tries <= 6
 
 
