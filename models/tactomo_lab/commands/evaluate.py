@@ -36,10 +36,6 @@ if TYPE_CHECKING:
 
 MAPS = ("frames", "ICC", "worst", "shape", "RIE", "flagged", "wrong", "ms", "p99")
 CONTACTS = (*("counted", "missed", "false", "mm", "p95", "area"), *("Δσ", "spread", "kPa", "in σ"))
-PHASES = (
-    *("frames", "ICC", "worst", "shape", "counted", "lost", "most", "ids"),
-    *("flagged", "wrong", "ms", "p99"),
-)
 FIELD_MAPS = (
     *("frames", "ICC", "RIE", "worst", "shape", "flagged", "silent", "wrong", "alarms"),
     *("ms", "p99"),
@@ -180,60 +176,6 @@ def _decibels(text: str) -> list[float]:
     return ratios
 
 
-# ------------------------------------------------------------------ moving scenes
-
-
-@app.command(
-    epilog=options.examples(
-        "tactomo evaluate moving",
-        "tactomo evaluate moving --count 10 --snr 20 --budget-ms 100",
-        "tactomo evaluate moving --seeds reporting --json > moving.json",
-    )
-)
-def moving(
-    seeds: Seeds = "tuning",
-    count: Annotated[int, typer.Option(min=1, help="Sequences.")] = 3,
-    snr: Annotated[float, typer.Option(help="Signal-to-noise ratio in dB.")] = 40.0,
-    snr_of: SnrOf = "change",
-    method: options.Method = "auto",
-    budget_ms: Annotated[
-        float | None, typer.Option(min=1.0, help="Compute time a frame may take. [the daemon's]")
-    ] = None,
-    sensor: options.Description = options.DEFAULT_DESCRIPTION,
-    as_json: options.JsonOutput = False,
-) -> None:
-    """Follow simulated contacts that slide, land, lift, jump, merge and split, frame by frame.
-
-    Each sequence has lost scans, a tare and its own sheets (see `tactomo evaluate scenes`), at 20
-    frames a second, under the daemon's budget. The first run simulates (a minute a sequence) and
-    keeps the voltages in the cache.
-    """
-    from tactomo_models import load_description
-
-    from tactomo_lab.evaluation.moving import draw_sequence, summarise_phases
-    from tactomo_lab.evaluation.play import Variant, play
-
-    description = load_description(sensor)
-    draw = partial(draw_sequence, description, seeds, snr_db=snr, snr_of=snr_of)
-    variant = Variant(method, None if budget_ms is None else budget_ms / 1e3)
-    played = []
-    for number in range(count):
-        outcomes = play(map(draw, [number]), variant)
-        name = f"sequence {number + 1} of {count}"
-        played.append([outcome.score for outcome in shown(outcomes, None, name)])
-    phases = summarise_phases(played)
-    settings = _settings(description.name, seeds, snr_of=snr_of, method=method)
-    told = {
-        **settings,
-        "snr_db": snr,
-        "budget_ms": budget_ms,
-        "phases": {name: asdict(summary) for name, summary in phases.items()},
-        "sequences": [[asdict(score) for score in scores] for scores in played],
-    }
-    tables = {f"{count} sequences, {snr:g} dB": PHASES}
-    tell(told, as_json, lambda to: print_suite(to, _in_words(settings), tables, phases))
-
-
 # ------------------------------------------------------------------ the field's rows
 
 
@@ -273,10 +215,11 @@ def field(
     mm, contact impedances by 30 %, sheets uneven by 10 %. *soft*: balls of 180 to 300 kPa, at 60 dB
     of the voltages. *graded*: one sheet alone, without an onset. *crowded*: five or six small
     contacts. *many*: eight to ten contacts. *mixed*: flat ellipses, rectangles, rings and balls
-    side by side, on hand-made skins, at 60 dB of the voltages. *moving*: a sequence of `tactomo
-    evaluate moving` for every ten scenes, without the frames of lost scans. *mixed-moving*: such a
-    sequence of mixed presses that land, glide, change pressure and lift, with noise 40 dB below
-    each frame's change or 60 dB below the voltages. *palm*: one contact at least 60 mm across, of 2
+    side by side, on hand-made skins, at 60 dB of the voltages. *moving*: a sequence for every ten
+    scenes, at 20 frames a second: contacts slide, land, lift, jump, merge and split, with lost
+    scans, whose frames are left out, and a tare. *mixed-moving*: such a sequence of mixed presses
+    that land, glide, change pressure and lift, with noise 40 dB below each frame's change or 60 dB
+    below the voltages. *palm*: one contact at least 60 mm across, of 2
     to 200 kPa, which comes in a second to ten minutes while the reference follows. *overload*: one
     to three presses, the first or all beyond the end of the response table. Scenes are simulated as
     in `tactomo evaluate scenes`; still scenes are reconstructed from a cold start. The first run

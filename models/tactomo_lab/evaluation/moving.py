@@ -2,8 +2,8 @@
 
 *The choreography*: contacts that slide, land, lift, jump, merge and split, lost scans and a tare,
 in eleven phases, played on a sheet of its own with indenters, place, contrast and sign drawn from
-its seed. What is asked: how well each phase is followed, how soon a warm start recovers from what
-kills it, whether contacts keep their identity, and whether a wrong frame says so.
+its seed. What is asked: how well each phase is followed, whether contacts keep their identity, and
+whether a wrong frame says so.
 
 *Mixed presses* are on skins made by hand. Each indenter has a lane of its own, clear of the others:
 it lands, glides along it, changes its pressure, and lifts. *A palm* comes in one second to ten
@@ -14,9 +14,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import chain, combinations
-from typing import Annotated, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 from tactomo_models.arrays import FloatArray
@@ -41,7 +41,6 @@ from tactomo_lab.scenes.case import (
     Frame,
     Plan,
     Simulated,
-    SnrOf,
     noise_std,
     simulate,
 )
@@ -55,7 +54,6 @@ from tactomo_lab.scenes.drawing import (
     is_inside,
     seed_of,
 )
-from tactomo_lab.scenes.measures import WRONG_ICC, Figure, Score, Summary, percentile, summarise
 
 Presses = Mapping[str, Press]
 NoiseOf = Literal["each change", "voltage"]
@@ -155,14 +153,7 @@ def choreography(
     ]
 
 
-def draw_sequence(
-    description: SensorDescription,
-    seed_set: SeedSet,
-    number: int,
-    *,
-    snr_db: float = 40.0,
-    snr_of: SnrOf = "change",
-) -> Case:
+def draw_sequence(description: SensorDescription, seed_set: SeedSet, number: int) -> Case:
     """Draw and simulate the choreography: about a minute, or read from the cache.
 
     Raises DataError where there is no room on the sensor.
@@ -171,12 +162,14 @@ def draw_sequence(
     contrast, opposite = draw_contrast(rng), bool(rng.integers(2))
     steps = _draw_choreography(description, rng)
     opposite = opposite and can_be_opposite(description)
-    plan = Plan(_frames(steps), contrast, opposite, snr_db=snr_db, snr_of=snr_of)
+    plan = Plan(_frames(steps), contrast, opposite)
     simulated = simulate(description, plan, seed_of(seed_set, "moving sheet", number))
     under_load = np.array([bool(step.presses) for step in steps])
     pressed = {name: scans[under_load] for name, scans in simulated.volts.pressed.items()}
     loaded = replace(simulated.volts, pressed=pressed)
-    noise = {name: noise_std(loaded, name, snr_db, snr_of) for name in description.channels}
+    noise = {
+        name: noise_std(loaded, name, plan.snr_db, plan.snr_of) for name in description.channels
+    }
     seed = seed_of(seed_set, "moving noise", number)
     return follow(simulated, steps, noise, np.random.default_rng(seed), seed_set, number)
 
@@ -434,52 +427,3 @@ def _course(draw: Draw, lane: Lane, frames: int) -> list[Press]:
         )
         for along, pressure in zip(way_m.tolist(), kpa.tolist(), strict=True)
     ]
-
-
-# ------------------------------------------------------------------ summing up
-
-
-@dataclass(frozen=True)
-class PhaseSummary(Summary):
-    """One phase over many sequences."""
-
-    recovery: Annotated[
-        float,
-        Figure(
-            "lost", ".0f", "longest run of frames in which the shape's ICC is below 0.8, median"
-        ),
-    ]
-    recovery_most: Annotated[float, Figure("most", ".0f", "... of the slowest sequence")]
-    switches: Annotated[int, Figure("ids", "d", "identities lost")]
-
-
-def summarise_phases(sequences: Iterable[Iterable[Score]]) -> dict[str, PhaseSummary]:
-    """Measures of each phase, in order, and of all of them under "all"."""
-    played = [list(scores) for scores in sequences]
-    phases = dict.fromkeys(score.phase for scores in played for score in scores)
-    parts = {
-        phase: [[score for score in scores if score.phase == phase] for scores in played]
-        for phase in phases
-    }
-    summaries = {name: _summarise(part) for name, part in parts.items()}
-    return {**summaries, "all": _summarise([one for part in parts.values() for one in part])}
-
-
-def _summarise(played: list[list[Score]]) -> PhaseSummary:
-    scores = [score for part in played for score in part]
-    recovery = [_recovery(part) for part in played]
-    return PhaseSummary(
-        **asdict(summarise(scores)),
-        recovery=percentile(recovery, 50),
-        recovery_most=percentile(recovery, 100),
-        switches=sum(score.switches for score in scores),
-    )
-
-
-def _recovery(scores: list[Score]) -> float:
-    """Longest run of frames whose shape is wrong; NaN where none of them is pressed."""
-    icc = np.array([score.icc_structure for score in scores])
-    wrong = icc[np.isfinite(icc)] < WRONG_ICC
-    if len(wrong) == 0:
-        return float("nan")
-    return float(max(len(run) for run in "".join("x" if w else " " for w in wrong).split(" ")))

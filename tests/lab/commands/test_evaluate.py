@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -62,23 +61,6 @@ def test_what_it_cannot_read_is_a_usage_error(tactomo: Run, option: str, value: 
     result = tactomo("evaluate", "scenes", option, value)
     assert result.returncode == 2
     assert f"{value!r}: give" in result.stderr
-
-
-@pytest.mark.long
-def test_moving_scenes(tactomo: Run, tmp_path: Path) -> None:
-    """On a coarse map, so that a sequence is simulated in seconds."""
-    shipped = resources.files("tactomo_models.sensor.shipped").joinpath("paper_square.toml")
-    sensor = tmp_path / "coarse.toml"
-    sensor.write_text(shipped.read_text("utf-8") + "[map]\nnodes_x = 21\nnodes_y = 21\n")
-    moving = ("evaluate", "moving", "--count", 1, "--description", sensor)
-    words = tactomo(*moving, "--budget-ms", 20)
-    assert words.returncode == 0
-    assert "Simulated, not measured" in words.stdout
-    for phase in ("slide", "jump", "merge", "split", "lost scans", "tare", "all"):
-        assert f" {phase} " in words.stdout
-    numbers = json.loads(tactomo(*moving, "--method", "noser", "--json").stdout)
-    assert numbers["simulated"] is True
-    assert numbers["phases"]["all"]["frames"] == len(numbers["sequences"][0])
 
 
 @pytest.mark.long

@@ -10,14 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_score import made_score
 from tactomo_lab.evaluation.moving import (
     INDENTERS,
     Step,
     choreography,
     draw_sequence,
     follow,
-    summarise_phases,
 )
 from tactomo_lab.evaluation.play import Variant, play
 from tactomo_lab.evaluation.trade_off import measure
@@ -159,28 +157,6 @@ def test_a_tare_forgets_who_was_who(paper: SensorDescription, simulator: SkinSim
     held = Step("hold", {"A": press("A")})
     scores = played(sequence(paper, simulator, held, held, replace(held, tare=True)))
     assert [score.switches for score in scores] == [0, 0, 1]
-
-
-def frame(phase: str, icc: float, found: int = 1, distrusted: bool = False) -> Score:
-    told = {"phase": phase, "found": found, "distrusted": distrusted, "wrong": icc < 0.8}
-    return made_score(**told, rie=1 - icc, icc=icc, icc_structure=icc)
-
-
-def test_phases_by_hand() -> None:
-    bad, good, blank = frame("a", 0.5), frame("a", 0.9), replace(frame("a", 0.9), icc=np.nan)
-    blank = replace(blank, icc_structure=np.nan)
-    first = [bad, bad, blank, bad, good, bad, frame("b", 0.95, found=2)]
-    second = [good, frame("a", 0.5, distrusted=True), good, frame("b", 0.95)]
-    phases = summarise_phases([first, second])
-    assert list(phases) == ["a", "b", "all"]
-    a, b = phases["a"], phases["b"]
-    assert (a.frames, b.frames, phases["all"].frames) == (9, 2, 11)
-    assert (a.recovery, a.recovery_most) == (2, 3)
-    assert (b.recovery, b.count_right, a.count_right) == (0, 0.5, 1)
-    assert a.confidently_wrong == pytest.approx(4 / 9)
-    assert b.confidently_wrong == pytest.approx(1 / 2)
-    assert a.distrusted == pytest.approx(1 / 9)
-    assert a.icc == pytest.approx((5 * 0.5 + 3 * 0.9) / 8)
 
 
 @pytest.mark.long
