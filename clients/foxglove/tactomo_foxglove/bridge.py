@@ -19,7 +19,6 @@ import zmq
 from foxglove.channels import FrameTransformsChannel
 from foxglove.websocket import StatusLevel, WebSocketServer
 from tactomo_client import ClientError, Frame, Keys, MessageError, schema
-from tactomo_client.appearance import Placement
 from tactomo_client.connection import connect_subscriber
 from tactomo_client.messages import (
     EVENT,
@@ -59,7 +58,6 @@ class Bridge:
         host: str = DEFAULT_HOST,  # the address to listen on
         port: int = DEFAULT_PORT,  # the port to listen on; 0 takes a free one
         keys: Keys | None = None,  # for a daemon beyond this computer
-        placement: Placement | None = None,  # where the sensor hangs; of several, all hang there
         # of further web pages that may look, such as ``http://localhost:8080``
         origins: Sequence[str] = (),
     ) -> None:
@@ -73,10 +71,9 @@ class Bridge:
             self._connection.close()
             raise
         self.host = host
-        placed = placement or Placement()
         transforms = FrameTransformsChannel("/tf", context=self._context)
         self._sensors = {
-            sensor: _Sensor(SensorTopics(sensor, self._context, transforms, placed), stream)
+            sensor: _Sensor(SensorTopics(sensor, self._context, transforms), stream)
             for sensor in sensors
         }
 

@@ -16,7 +16,6 @@ import numpy as np
 from foxglove import messages as fox
 from numpy.typing import NDArray
 from tactomo_client import Contact, Frame, appearance
-from tactomo_client.appearance import Placement
 
 Pixels = NDArray[np.uint8]
 
@@ -48,17 +47,16 @@ def frame_of(sensor: str, description: Mapping[str, Any]) -> str:
     return str((description.get("mount") or {"frame": sensor})["frame"])
 
 
-def transforms(child: str, placement: Placement, time_ns: int) -> fox.FrameTransforms:
-    """Return where the sensor hangs, or the link that carries it."""
-    x, y, z, w = placement.quaternion
+def transforms(child: str, time_ns: int) -> fox.FrameTransforms:
+    """Return that the sensor, or the link that carries it, is at the world's origin."""
     return fox.FrameTransforms(
         transforms=[
             fox.FrameTransform(
                 timestamp=to_timestamp(time_ns),
-                parent_frame_id=placement.parent,
+                parent_frame_id="world",
                 child_frame_id=child,
-                translation=fox.Vector3(x=placement.x_m, y=placement.y_m, z=placement.z_m),
-                rotation=fox.Quaternion(x=x, y=y, z=z, w=w),
+                translation=fox.Vector3(),
+                rotation=_UPRIGHT,
             )
         ]
     )

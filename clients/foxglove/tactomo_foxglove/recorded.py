@@ -9,7 +9,6 @@ import foxglove
 from foxglove.channels import FrameTransformsChannel
 from foxglove.mcap import MCAPWriteOptions
 from tactomo_client import Frame
-from tactomo_client.appearance import Placement
 
 from tactomo_foxglove.topics import SensorTopics
 
@@ -23,12 +22,11 @@ def write_mcap(
     file: IO[bytes],  # a file opened for writing, which stays open
     sensor: str,  # the sensor's name
     description: Mapping[str, Any],  # the sensor, as `status` has it; empty where it is not known
-    placement: Placement | None = None,  # where the sensor hangs
 ) -> int:
     """Write frames as an MCAP file, one at a time; return how many. Raises OSError as files do."""
     context = foxglove.Context()
     transforms = FrameTransformsChannel("/tf", context=context)
-    topics = SensorTopics(sensor, context, transforms, placement or Placement())
+    topics = SensorTopics(sensor, context, transforms)
     options = MCAPWriteOptions(profile=PROFILE, compression_threads=0)
     count = 0
     writer = foxglove.open_mcap(file, context=context, writer_options=options)

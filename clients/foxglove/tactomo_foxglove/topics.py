@@ -12,7 +12,6 @@ from typing import Any, Final
 import foxglove
 from foxglove import channels
 from tactomo_client import Contact, Frame, Status
-from tactomo_client.appearance import Placement
 from tactomo_client.schema import HealthIssue, Percentiles, Rates, wire_fields
 from tactomo_client.touch import Traces
 
@@ -93,12 +92,10 @@ class SensorTopics:
         sensor: str,
         context: foxglove.Context,
         transforms: channels.FrameTransformsChannel,
-        placement: Placement,
     ) -> None:
         self.sensor = sensor
         # the sensor, as `status` has it; empty until `sheet` has said it
         self.description: Mapping[str, Any] = {}
-        self._placement = placement
         self._last: Frame | None = None
         self._traces = Traces()
         self._transforms = transforms
@@ -146,9 +143,7 @@ class SensorTopics:
 
     def _hang(self, time_ns: int) -> None:
         self._transforms.log(
-            messages.transforms(
-                messages.frame_of(self.sensor, self.description), self._placement, time_ns
-            ),
+            messages.transforms(messages.frame_of(self.sensor, self.description), time_ns),
             log_time=time_ns,
         )
 

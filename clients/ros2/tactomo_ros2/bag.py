@@ -8,7 +8,6 @@ from typing import Final
 
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from tactomo_client import Frame
-from tactomo_client.appearance import Placement
 from tactomo_client.schema import Mount
 
 from tactomo_ros2.messages import TYPES, ros_messages, topic_types
@@ -21,7 +20,6 @@ def write_bag(
     frames: Iterable[tuple[int, Frame, float | None]],
     folder: Path,
     sensor: str,
-    placement: Placement | None = None,
     mount: Mount | None = None,
 ) -> int:
     """Write frames as a bag, and return how many there were; a chunk at a time is in memory.
@@ -34,7 +32,6 @@ def write_bag(
             it was published, seconds, if that is known.
         folder: the bag, which must not be there yet; its files have its name.
         sensor: the sensor's name.
-        placement: where the sensor hangs; None writes no transform for that.
         mount: the link that carries the sheet; None: the map is flat, in the sensor's own frame.
 
     Raises:
@@ -52,6 +49,6 @@ def write_bag(
         for time_ns, frame, age_s in frames:
             count += 1
             published_ns = time_ns + round((age_s or 0.0) * 1e9)
-            for message in ros_messages(frame, time_ns, age_s, placement, mount):
+            for message in ros_messages(frame, time_ns, age_s, mount):
                 bag.write(topics[message.topic], published_ns, message.cdr)
     return count

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Final
 
 from tactomo_client import Event, Frame, Status, Subscription
-from tactomo_client.appearance import Placement
 from tactomo_client.schema import Mount
 
 from tactomo_ros2.messages import (
@@ -27,7 +26,6 @@ def run(
     skin: Subscription[Frame | Status | Event],
     publish: Callable[[RosMessage], None],
     is_over: Callable[[], bool],
-    placement: Placement | None = None,
 ) -> None:
     """Publish every frame, what is wrong, and once a second that none comes, until `is_over`.
 
@@ -45,7 +43,7 @@ def run(
         elif isinstance(item, Frame):
             last = item
             at_ns = last.acquired_realtime_ns
-            for message in ros_messages(last, at_ns, last.age_s, placement, mount):
+            for message in ros_messages(last, at_ns, last.age_s, mount):
                 publish(message)
             due_s = time.monotonic() + REMIND_S
         if time.monotonic() >= due_s:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 from tactomo_client import Contact, Frame, Status
-from tactomo_client.appearance import Placement, surface_nodes, towards
+from tactomo_client.appearance import surface_nodes, towards
 from tactomo_client.schema import PRESSURE_RANGES, Mount, table_row
 from tactomo_client.touch import CONTACT_COLUMNS
 
@@ -72,7 +72,6 @@ def ros_messages(
     frame: Frame,
     time_ns: int,
     age_s: float | None,
-    placement: Placement | None = None,
     mount: Mount | None = None,
 ) -> Iterator[RosMessage]:
     """Yield what a frame says; a frame without images has no map.
@@ -81,7 +80,6 @@ def ros_messages(
         frame: the frame.
         time_ns: when it was acquired, ROS time: nanoseconds since 1970.
         age_s: how old it was when it was published; None where nobody knows it.
-        placement: where the sensor hangs; None where the robot's own description says so.
         mount: the link that carries the sheet, by the sensor's status; None: the map is flat, in
             the sensor's own frame. Contacts know their link themselves.
     """
@@ -99,7 +97,7 @@ def ros_messages(
     for contact in frame.contacts:
         said.append((wrenches, _wrench(frame, contact, header.stamp)))
         said.append((poses, _pose(contact, header)))
-    if transforms := _transforms(frame, header, placement):
+    if transforms := _transforms(frame, header):
         said.append((tf, _new("tf2_msgs/msg/TFMessage", transforms=transforms)))
     for topic, message in said:
         yield RosMessage(topic, types[topic], bytes(TYPES.serialize_cdr(message, types[topic])))
@@ -242,7 +240,7 @@ def _pose(contact: Contact, header: Any) -> Any:
     return _new("geometry_msgs/msg/PoseWithCovarianceStamped", header=header, pose=with_covariance)
 
 
-def _transforms(frame: Frame, header: Any, placement: Placement | None) -> list[Any]:
+def _transforms(frame: Frame, header: Any) -> list[Any]:
     def transform(parent: str, child: str, position: Vector, turned: Quaternion) -> Any:
         x, y, z, w = turned
         pose = _new(
@@ -258,9 +256,6 @@ def _transforms(frame: Frame, header: Any, placement: Placement | None) -> list[
         )
 
     hung = []
-    if placement is not None:
-        at = (placement.x_m, placement.y_m, placement.z_m)
-        hung = [transform(placement.parent, frame.sensor, at, placement.quaternion)]
     for contact in frame.contacts:
         parent, position, turned = _whereabouts(contact, frame.sensor)
         hung.append(transform(parent, _contact_frame(frame, contact), position, turned))

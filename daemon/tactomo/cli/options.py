@@ -185,10 +185,6 @@ Announce: TypeAlias = Annotated[
         "--announce", help="Print one line of JSON with the addresses when ready, for programs."
     ),
 ]
-Pose: TypeAlias = Annotated[
-    str,
-    typer.Option(metavar="X,Y,Z[,ROLL,PITCH,YAW]", help="Pose in that frame, metres and degrees."),
-]
 TwinPorts: TypeAlias = Annotated[
     int | None,
     typer.Option(min=1, max=2, help="One line for both channels, or a line for each. [each]"),

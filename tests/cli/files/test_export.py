@@ -113,7 +113,7 @@ def test_an_image_that_the_sensor_never_has_is_nan(tactomo: Run, tmp_path: Path)
 
 
 def test_a_file_for_foxglove(tactomo: Run, grasp: Path) -> None:
-    result = tactomo("export", grasp, "fox.mcap", "--layout", "left.json", "--pose", "0,0,1")
+    result = tactomo("export", grasp, "fox.mcap", "--layout", "left.json")
     assert result.returncode == 0, result.stderr
     fox = grasp.with_name("fox.mcap")
     numbers = decoded(fox, f"/{SENSOR}/frame")
@@ -125,7 +125,7 @@ def test_a_file_for_foxglove(tactomo: Run, grasp: Path) -> None:
     assert len(decoded(fox, f"/{SENSOR}/grid")) == FRAMES - 5
     assert len(decoded(fox, f"/{SENSOR}/image")) == FRAMES - 5
     assert len(decoded(fox, f"/{SENSOR}/sheet")) == 1
-    assert decoded(fox, "/tf")[0][1].transforms[0].translation.z == 1.0
+    assert decoded(fox, "/tf")[0][1].transforms[0].parent_frame_id == "world"
     assert f"/{SENSOR}/grid" in grasp.with_name("left.json").read_text()
 
 

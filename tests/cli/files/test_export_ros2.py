@@ -145,17 +145,11 @@ def test_ages_are_kept(exported: tuple[Path, Any]) -> None:
     assert "storage_identifier: mcap\n  " in (bag / "metadata.yaml").read_text()
 
 
-def test_where_the_sensor_hangs_is_told_only_if_asked(tactomo: Run, tmp_path: Path) -> None:
+def test_where_the_sensor_hangs_is_not_told(tactomo: Run, tmp_path: Path) -> None:
     """Two parents of one frame would break a robot's tree of transforms."""
     write_grasp(tmp_path / "grasp.mcap", range(10))
     assert tactomo("export", "grasp.mcap", "plain", "--ros2").returncode == 0
     assert "/tf" not in read(tmp_path / "plain")
-    hung = ("--parent", "forearm_link", "--pose", "0,0,1,0,0,90")
-    assert tactomo("export", "grasp.mcap", "hung", "--ros2", *hung).returncode == 0
-    transform = read(tmp_path / "hung")["/tf"][0][1].transforms[0]
-    assert (transform.header.frame_id, transform.child_frame_id) == ("forearm_link", SENSOR)
-    assert transform.transform.translation.z == 1.0
-    assert transform.transform.rotation.z == pytest.approx(math.sqrt(0.5))
 
 
 def test_a_clock_that_jumps_and_lost_frames_are_named(tactomo: Run, tmp_path: Path) -> None:
@@ -187,7 +181,6 @@ def test_a_clock_that_jumps_and_lost_frames_are_named(tactomo: Run, tmp_path: Pa
     [
         (["grasp.mcap", "bag.mcap", "--ros2"], 2, "name bag"),
         (["grasp.mcap", "there", "--ros2", "--force"], 1, "there exists already"),
-        (["grasp.mcap", "bag", "--ros2", "--parent", "x", "--pose", "1"], 2, "X,Y,Z"),
         (["grasp.mcap", "bag"], 2, "--ros2"),
     ],
 )

@@ -9,8 +9,6 @@ ARGUMENTS = {
     "sensor": "skin",
     "stream": "tcp://127.0.0.1:5560",
     "keys": "",
-    "parent": "",
-    "pose": "0,0,0",
 }
 
 

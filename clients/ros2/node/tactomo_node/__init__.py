@@ -1,8 +1,8 @@
 """A ROS 2 node that publishes a tactomo sensor over whatever RMW the robot has.
 
 It needs `pip install 'tactomo[ros2]'` in ROS's Python (3.12: Jazzy, Kilted). Parameters: `sensor`
-and `stream`, whose they are; `keys`, a folder, for a daemon beyond this computer; `parent` and
-`pose`, where the sensor hangs, as in `tactomo export --ros2`; `tf`, whether contacts get frames.
+and `stream`, whose they are; `keys`, a folder, for a daemon beyond this computer; `tf`, whether
+contacts get frames.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from tactomo_client import DEFAULT_STREAM, ClientError, subscribe
-from tactomo_client.appearance import Placement
 from tactomo_ros2.live import run
 from tactomo_ros2.messages import RosMessage, topic_types
 
@@ -45,8 +44,7 @@ def _publish(node: Node, is_over: Callable[[], bool]) -> None:
         return node.declare_parameter(name, default).value
 
     sensor, stream = parameter("sensor", "skin"), parameter("stream", DEFAULT_STREAM)
-    keys, parent = parameter("keys", ""), parameter("parent", "")
-    pose, has_tf = parameter("pose", "0,0,0"), parameter("tf", True)
+    keys, has_tf = parameter("keys", ""), parameter("tf", True)
     publishers = {}
     for topic, kind in topic_types(sensor).items():
         package, _, name = kind.split("/")
@@ -58,7 +56,6 @@ def _publish(node: Node, is_over: Callable[[], bool]) -> None:
         if message.topic in publishers and rclpy.ok():
             publishers[message.topic].publish(message.cdr)
 
-    placement = Placement.parse(parent, pose) if parent else None
     with subscribe(sensor, kind=("map", "status"), address=stream, keys=keys or None) as skin:
         node.get_logger().info(f"publishing {sensor} of {stream}")
-        run(skin, publish, is_over, placement)
+        run(skin, publish, is_over)

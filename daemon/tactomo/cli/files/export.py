@@ -18,10 +18,10 @@ from tactomo.cli.files.recorded_frames import (
     ToOption,
     recorded_frames,
 )
-from tactomo.cli.options import Force, Pose, RecordedDescription, examples, typer_app
+from tactomo.cli.options import Force, RecordedDescription, examples, typer_app
 from tactomo.cli.output import say
 from tactomo.cli.plot.plot import prepare_file
-from tactomo.cli.run.foxglove import placement_of, write_layout
+from tactomo.cli.run.foxglove import write_layout
 from tactomo.errors import TactomoError, needs, os_errors_as
 
 if TYPE_CHECKING:
@@ -83,11 +83,6 @@ def export(
     layout: Annotated[
         Path | None, typer.Option(help="For .mcap: also write a layout to import in Foxglove.")
     ] = None,
-    parent: Annotated[
-        str | None,
-        typer.Option(help="For .mcap and --ros2: parent frame of the sensor. [world; a bag: none]"),
-    ] = None,
-    pose: Pose = "0,0,0",
     force: Force = False,
 ) -> None:
     """Write the frames of a recording in a format of other programs, by the extension of OUT.
@@ -126,7 +121,7 @@ def export(
     if kind == DATASET:
         write = _dataset_writer(robot, fps, task, gaps, told)
     else:
-        write = _writer(kind, parent, pose, output.parent)
+        write = _writer(kind, output.parent)
     with recorded_frames(recording, description, start_s, end_s, output.parent) as frames:
         moments = frames.moments("contacts" if kind == ".csv" else "map")
         watched = gaps.watch(frames.with_progress(moments, "exporting"))
@@ -151,7 +146,7 @@ def _kind(output: Path) -> str:
     return kind
 
 
-def _writer(kind: str, parent: str | None, pose: str, scratch: Path) -> Writer:
+def _writer(kind: str, scratch: Path) -> Writer:
     from tactomo_client.filled import filled
     from tactomo_client.schema import Mount
 
@@ -169,21 +164,18 @@ def _writer(kind: str, parent: str | None, pose: str, scratch: Path) -> Writer:
         with needs("Foxglove", "pip install 'tactomo[foxglove]'"):
             from tactomo_foxglove import write_mcap
 
-        placement = placement_of(parent or "world", pose)
-
         def write(frames: RecordedFrames, moments: Moments, file: IO[bytes]) -> int:
             about = {} if frames.description is None else description_fields(frames.description)
-            return write_mcap(_timed(frames, moments), file, frames.sensor, about, placement)
+            return write_mcap(_timed(frames, moments), file, frames.sensor, about)
 
         return write
     with needs("a ROS 2 bag", "pip install 'tactomo[ros2]'"):
         from tactomo_ros2.bag import write_bag
-    hung = None if parent is None else placement_of(parent, pose)
 
     def write_folder(frames: RecordedFrames, moments: Moments, folder: Path) -> int:
         about = {} if frames.description is None else description_fields(frames.description)
         mount = filled(Mount, about["mount"]) if about.get("mount") else None
-        return write_bag(_timed(frames, moments), folder, frames.sensor, hung, mount)
+        return write_bag(_timed(frames, moments), folder, frames.sensor, mount)
 
     return write_folder
 

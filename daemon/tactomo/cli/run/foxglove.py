@@ -14,7 +14,6 @@ from tactomo.cli.sensors import find_sensor
 from tactomo.errors import TactomoError, needs, os_errors_as
 
 if TYPE_CHECKING:
-    from tactomo_client.appearance import Placement
     from tactomo_foxglove import Bridge
 
 DEFAULT_PORT = 8765
@@ -26,7 +25,6 @@ app = options.typer_app()
     epilog=options.examples(
         "tactomo foxglove",
         "tactomo foxglove left_forearm --layout left_forearm.json",
-        "tactomo foxglove left_forearm --parent forearm_link --pose 0,0.04,0.12,0,90,0",
         "ssh -L 8765:127.0.0.1:8765 robot tactomo foxglove",
     )
 )
@@ -46,8 +44,6 @@ def foxglove(
         Path | None,
         typer.Option(help="Write the layout of the (first) sensor here, to import in Foxglove."),
     ] = None,
-    parent: Annotated[str, typer.Option(help="Parent frame of the sensor.")] = "world",
-    pose: options.Pose = "0,0,0",
     allow_origin: Annotated[
         list[str] | None,
         typer.Option(
@@ -73,7 +69,6 @@ def foxglove(
     from tactomo_client.keys import as_keys
     from tactomo_foxglove import Bridge
 
-    placement = placement_of(parent, pose)
     if address is None or not sensors:
         found = find_sensor(sensors[0] if sensors else None, address, keys)
         sensors, address = sensors or [found.sensor], found.stream
@@ -86,7 +81,6 @@ def foxglove(
         host,
         foxglove_port,
         as_keys(keys),
-        placement,
         allow_origin or (),
     ) as bridge:
         _print_addresses(bridge, layout, announce)
@@ -108,13 +102,3 @@ def write_layout(path: Path, sensor: str) -> None:
 
     with os_errors_as(TactomoError, f"cannot write {path}", "name a file that you may write"):
         path.write_text(layout_for(sensor), "utf-8")
-
-
-def placement_of(parent: str, pose: str) -> Placement:
-    """Return the placement that the options mean."""
-    from tactomo_client.appearance import Placement
-
-    try:
-        return Placement.parse(parent, pose)
-    except ValueError as error:
-        raise typer.BadParameter(f"--pose {pose}: {error}") from error
