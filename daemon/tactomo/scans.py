@@ -104,8 +104,6 @@ class Mark:
     is_cold: bool = False
     """Whether what came before is unknown, so that the reconstruction starts anew with it."""
     timing: Timing | None = None  # None where an older version recorded
-    is_cut: bool = False
-    """Whether it began another file, so that the reconstruction forgot what shapes there were."""
     calibration: str | None = None
     """Of pressure, to be put in force just before it: the text of its file, empty for none."""
     calibration_number: int = 0

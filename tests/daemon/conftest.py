@@ -12,7 +12,7 @@ import zmq
 from daemon_bench import PATIENT_SYNC_MS, Bench, Heard, Line, Listener, Memory, Skin
 from tactomo.config import load_config
 from tactomo.log import configure_logging
-from tactomo.recordings.recording_set import open_replayable
+from tactomo.recordings.recording import open_recording
 from tactomo.service.daemon import Daemon
 from tactomo_client import Keys
 from waiting import wait_until
@@ -119,7 +119,7 @@ def replay(tmp_path: Path) -> Callable[..., Any]:
         out = tmp_path / f"replayed-{next(count)}.mcap"
         settings = {
             "name": "left",
-            "ports": open_replayable(path).replay_urls(speed),
+            "ports": open_recording(path).replay_urls(speed),
             "stream": "tcp://127.0.0.1:0",
             "control": "tcp://127.0.0.1:0",
             "tare_scans": 3,

@@ -14,7 +14,7 @@ import pytest
 from mcap.reader import make_reader
 from selenium.webdriver import Chrome
 from shared_data import measured
-from tactomo.recordings.recording_set import open_replayable
+from tactomo.recordings.recording import open_recording
 from tactomo_client import request, subscribe
 from tactomo_client.messages import MAP, decode_message
 from waiting import PATIENCE_S, wait_until
@@ -120,7 +120,7 @@ def test_a_replay_with_a_page_begins_when_it_is_open_and_shows_where_it_is_moved
         )
         request("replay", control, PATIENCE_S, paused=True)
         wait_until(lambda: browser.execute_script(SHOWN)[0] == "replay-paused")
-        recording, recorded = open_replayable(path), maps_in(path)
+        recording, recorded = open_recording(path), maps_in(path)
         times_s = {
             mark.scans[0].counter: (mark.clock_ns - recording.start_ns) * 1e-9
             for mark in recording.marks()

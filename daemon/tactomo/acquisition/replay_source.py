@@ -1,7 +1,5 @@
 """A source that says again what a recorded port said: ``replay:///path.mcap?port=0``.
 
-The path may also be a folder of recordings that a daemon has cut, see `recording_set`.
-
 Options of the URL:
 
 ``port``

@@ -340,8 +340,6 @@ class Imaging:
         self.method.obey(Effort(mark.tier, mark.budget_ms))
         if mark.is_cold:
             self._reconstructor.reset()
-        if mark.is_cut:
-            self._reconstructor.forget_shape()
         self.calibration.obey(mark.calibration)
         if mark.reference is not None and mark.reference is not self.reference:
             self._reconstructor.set_reference(mark.reference)

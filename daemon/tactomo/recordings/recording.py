@@ -184,8 +184,21 @@ class Recording:
 
         What came between the preamble and that time comes with it, at that time.
         """
-        for message in self.port_messages(port, from_ns):
-            yield Chunk(max(message.log_time, from_ns), message.data)
+        topics = (f"port/{port}", f"port/{port}/hello")
+        before: list[Message] = []  # from the last preamble on
+        for topic, message in _messages(self.path, from_ns - PREAMBLE_REACH_NS):
+            if topic not in topics:
+                continue
+            if message.log_time >= from_ns:
+                for each in (*before, message):
+                    yield Chunk(max(each.log_time, from_ns), each.data)
+                before = []
+            elif topic == topics[1]:
+                before = [message]
+            elif before and message.log_time - before[0].log_time < PREAMBLE_REACH_NS:
+                before.append(message)
+            else:
+                before = []
 
     def packets(self, port: int) -> Iterator[tuple[int, Packet]]:
         """Yield what port `port` said, decoded, each packet with its time as `Chunk` has it."""
@@ -193,24 +206,6 @@ class Recording:
         for clock_ns, data in self.chunks(port):
             for packet in protocol.feed(data):
                 yield clock_ns, packet
-
-    def port_messages(self, port: int, from_ns: int = 0) -> Iterator[Message]:
-        """Yield the same as messages, with the time on the wall clock, too."""
-        topics = (f"port/{port}", f"port/{port}/hello")
-        before: list[Message] = []  # from the last preamble on
-        for topic, message in _messages(self.path, from_ns - PREAMBLE_REACH_NS):
-            if topic not in topics:
-                continue
-            if message.log_time >= from_ns:
-                yield from before
-                before = []
-                yield message
-            elif topic == topics[1]:
-                before = [message]
-            elif before and message.log_time - before[0].log_time < PREAMBLE_REACH_NS:
-                before.append(message)
-            else:
-                before = []
 
     def marks(self) -> list[Mark]:
         """Return the dual scans that were reconstructed, each with what was new just before it."""

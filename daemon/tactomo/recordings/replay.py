@@ -16,9 +16,9 @@ from tactomo.recordings.recording import (
     REPLAY_SCHEME,
     Recording,
     calibration_text,
+    open_recording,
     recorded_calibration,
 )
-from tactomo.recordings.recording_set import open_replayable
 from tactomo.scans import Delivery, Mark
 
 
@@ -147,7 +147,7 @@ def parse_replay_url(url: str) -> tuple[Recording, int, float]:
             f"{url} is not a replay URL",
             f"use {REPLAY_SCHEME}:///absolute/path.mcap?port=0&speed=1",
         ) from error
-    recording = open_replayable(unquote(parts.netloc + parts.path))
+    recording = open_recording(unquote(parts.netloc + parts.path))
     ports = len(recording.origin.ports)
     if not 0 <= port < ports:
         raise PortError(

@@ -234,7 +234,7 @@ def record_board(paper: SensorDescription, volts: FloatArray, numbers: Sequence[
     )
 
 
-def test_a_device_without_a_clock_is_not_late(
+def test_a_device_without_a_clock_drifts_by_arrivals(
     tactomo: Run, rest: FloatArray, paper: SensorDescription
 ) -> None:
     record_board(paper, noisy(rest), range(40))
@@ -333,7 +333,6 @@ def test_a_running_daemon(tactomo: Run, demo: Demo) -> None:
         assert channel["verdict"] == "healthy"
         assert about(channel["findings"], "snr")["snr_db"] > 50
     assert about(found["stream"], "frames")["pressed"] == 0
-    assert about(found["stream"], "latency")["p50_ms"] > 0
     request("noise", demo.twin, PATIENCE_S, noise_v=0.02)
     request("garbage", demo.twin, PATIENCE_S, count=4000)
     outcome = tactomo(*look)

@@ -14,8 +14,7 @@ from tactomo.config import load_config
 from tactomo.imaging.imaging import MOVED_BUDGET_MS
 from tactomo.protocols import protocol_named
 from tactomo.recordings.playback import Playback
-from tactomo.recordings.recording import Origin
-from tactomo.recordings.recording_set import open_replayable
+from tactomo.recordings.recording import Origin, open_recording
 from tactomo.recordings.recording_writer import RecordingWriter
 from tactomo.service.daemon import Daemon
 from tactomo.service.status import STALE_S
@@ -35,7 +34,7 @@ def play(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
     def start(path: Path, start_s: float = 0.0, speed: float = 1.0, seconds: float = 0.0) -> Bench:
         settings = {
             "name": "left",
-            "ports": open_replayable(path).replay_urls(speed),
+            "ports": open_recording(path).replay_urls(speed),
             "stream": "tcp://127.0.0.1:0",
             "control": "tcp://127.0.0.1:0",
             "tare_scans": 3,
@@ -89,7 +88,7 @@ def life(request: pytest.FixtureRequest, bench: Start, tmp_path: Path) -> Life:
     for index in range(8):
         b.step(load=0.2 - 0.01 * index)
     b.ask("record_stop")
-    recording = open_replayable(path)
+    recording = open_recording(path)
     values = {f["scan_counter"]: value(f) for f in b.listener.of("map")}
     times = {m.scans[0].counter: m.clock_ns - recording.start_ns for m in recording.marks()}
     return Life(
@@ -358,7 +357,7 @@ def test_a_foreign_port_goes_on_in_the_middle_with_whole_scans_and_their_counter
         whole += [(at_ns, each.counter) for each in protocol.feed(data) if isinstance(each, Scan)]
     writer.flush()
     writer.close()
-    recording = open_replayable(tmp_path / "board.mcap")
+    recording = open_recording(tmp_path / "board.mcap")
     for after_s in (0.0, 3.4, 7.9):
         from_ns = begin_ns + round(after_s * 1e9)
         again = recording.origin.new_protocol()

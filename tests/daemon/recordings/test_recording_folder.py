@@ -15,10 +15,9 @@ from tactomo.config import RecordingConfig
 from tactomo.errors import RecordingError
 from tactomo.recordings import recorder
 from tactomo.recordings.recording import Origin, open_recording
-from tactomo.recordings.recording_set import open_replayable
 from tactomo.recordings.recording_writer import RecordingWriter
 from tactomo.recordings.rotation import KeptRecording, list_recordings, to_delete
-from tactomo_protocol import Channel, Decoder, Scan
+from tactomo_protocol import Channel
 
 Start = Callable[..., Any]
 DAY_S = 86_400.0
@@ -60,67 +59,14 @@ def test_each_file_replays_alone_and_together_they_have_every_frame_once(
             np.testing.assert_array_equal(image, live[counter], err_msg=f"{path} {counter}")
         again += replayed
     assert again == list(live) == list(range(1, last + 1))
-    whole = replay(folder).of("map")
-    assert maps_of(whole).keys() == live.keys()
-    for counter, image in maps_of(whole).items():
-        np.testing.assert_array_equal(image, live[counter], err_msg=f"{folder} {counter}")
-    identities = {f["scan_counter"]: [c["id"] for c in f["contacts"]] for f in whole}
-    assert identities == {
-        f["scan_counter"]: [c["id"] for c in f["contacts"]] for f in b.listener.of("map")
-    }
     for channel in Channel:
         assert {c for path in files for c in scan_counters(path, channel)} == set(again)
     assert rotated == len(files) - 1 >= 3
 
 
-@pytest.mark.slow
-def test_a_folder_says_every_byte_once_and_in_time(
-    bench: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recorder, "LOOK_S", 0.3)
-    folder = tmp_path / "set"
-    b = bench(ports=2, recording={"folder": folder, "at_start": True, "rotate_mb": 0.01})
-    b.tare()
-    while b.ask("status")["recorder"]["files"] < 4:
-        b.step(load=0.1)
-    b.daemon.stop()
-    whole = open_replayable(folder)
-    for port in (0, 1):
-        times = [chunk.clock_ns for chunk in whole.chunks(port)]
-        assert times == sorted(times)
-        decoder = Decoder()
-        said = [p for chunk in whole.chunks(port) for p in decoder.feed(chunk.data)]
-        counted = [p.counter for p in said if isinstance(p, Scan)]
-        assert counted == list(range(counted[0], counted[0] + len(counted)))
-        assert decoder.counts.corrupt == 0
-
-
-@pytest.mark.slow
-def test_a_night_between_two_files_is_not_waited_for(
-    bench: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "set"
-    rules = {"folder": folder, "at_start": True}
-    for hours in (0, 12):
-        later_ns, real_ns = hours * 3600 * 10**9, time.time_ns
-        monkeypatch.setattr(time, "time_ns", lambda by=later_ns, now=real_ns: now() + by)
-        b = bench(recording=rules)
-        b.tare()
-        b.step(load=0.1)
-        b.daemon.stop()
-        monkeypatch.undo()
-    times = [chunk.clock_ns for chunk in open_replayable(folder).chunks(0)]
-    assert times == sorted(times)
-    assert times[-1] - times[0] < 60e9
-
-
-def test_folders_that_cannot_be_played_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="holds no recordings"):
-        open_replayable(tmp_path)
-    for sensor in ("left", "right"):
-        (tmp_path / f"{sensor}-000001-20260131T120000Z.mcap").touch()
-    with pytest.raises(RecordingError, match="recordings of left, right"):
-        open_replayable(tmp_path)
+def test_a_folder_is_no_recording(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"no regular file; give the path of a \.mcap file"):
+        open_recording(tmp_path)
 
 
 def test_numbers_go_on_whatever_the_clock_and_strangers_do(bench: Start, tmp_path: Path) -> None:

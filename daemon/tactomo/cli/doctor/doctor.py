@@ -76,10 +76,11 @@ def doctor(
     as_json: options.JsonOutput = False,
     keys: options.KeysFolder = None,
 ) -> None:
-    """Examine a skin at rest: noise, reciprocity, electrodes, clipping, drift, line and latency.
+    """Examine a skin at rest: noise, reciprocity, electrodes, clipping, drift and line.
 
-    **Nothing may touch the skin meanwhile.** Exit status 0: healthy (maybe with advice). 1: ill
-    (something needs repair), broken (no reading can be trusted), or unknown.
+    `tactomo status` has the latency. **Nothing may touch the skin meanwhile.** Exit status 0:
+    healthy (maybe with advice). 1: ill (something needs repair), broken (no reading can be
+    trusted), or unknown.
 
     *SNR* is the ratio of the voltages to their standard deviation: 60 dB is good, below 36 dB is
     ill, below 20 dB broken. *Reciprocity*: on any sheet, V(drive; measure) = V(measure; drive), so

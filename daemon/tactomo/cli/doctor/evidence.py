@@ -53,10 +53,6 @@ class Heard(NamedTuple):
     corrupt: int  # packets that were damaged on their way
     faulty: int  # intact ones that break the protocol
     lost: int  # dual scans that the device took and nobody received, by gaps in the counter
-    # (n,) how much later than the promptest each scan came, by the device's clock
-    delay_ms: FloatArray
-    # from scan to scan on the device's clock; None where fewer than two came
-    period_ms: float | None
 
 
 @dataclass(frozen=True)
@@ -79,8 +75,6 @@ class Evidence:
     # before, after: the daemon's status then; empty but for a daemon
     before: Mapping[str, Any] = field(default_factory=dict)
     after: Mapping[str, Any] = field(default_factory=dict)
-    # (n,) of the frames when they were published
-    ages_ms: FloatArray = field(default_factory=lambda: np.zeros(0))
     flags: frozenset[str] = frozenset()  # those that any frame had
     pressed: int = 0  # frames with a contact
     frames: int = 0  # frames that came
@@ -126,7 +120,6 @@ def of_daemon(
     evidence.frames = len(said[MAP])
     evidence.flags = frozenset(flag for frame in said[MAP] for flag in frame["flags"])
     evidence.pressed = sum(bool(frame["contacts"]) for frame in said[MAP])
-    evidence.ages_ms = np.array([f["age_ns"] * 1e-6 for f in said[MAP] if f["age_ns"] is not None])
     return evidence
 
 
@@ -189,42 +182,14 @@ def _heard_of_messages(
 
     dropped = after["dropped_scans"] - before["dropped_scans"]
     counters = [m["scan_counter"] for m in messages]
-    device_ms = np.array([m["device_us"] for m in messages]) * 1e-3
-    if all(m.get("dated_by") == "device" for m in messages):
-        delays_ms = np.array([m["delay_ns"] for m in messages]) * 1e-6
-    else:  # the daemon does not know the device's clock yet: it is fitted here
-        arrived_ms = np.array([m["acquired_monotonic_ns"] for m in messages]) * 1e-6
-        delays_ms = _delays(arrived_ms, device_ms)
-    return Heard(
-        rise("packets"),
-        rise("corrupt"),
-        rise("faulty"),
-        max(0, _gaps(counters) - dropped),
-        delays_ms,
-        _period(device_ms, counters),
-    )
+    lost = max(0, _gaps(counters) - dropped)
+    return Heard(rise("packets"), rise("corrupt"), rise("faulty"), lost)
 
 
 def _gaps(counters: list[int]) -> int:
     """Scans missing between the first and the last; a counter that goes back starts anew."""
     steps = np.mod(np.diff(np.array(counters, dtype=np.int64)), SCAN_COUNTERS)
     return int((steps[(steps > 0) & (steps < SCAN_COUNTERS // 2)] - 1).sum())
-
-
-def _delays(arrived_ms: FloatArray, device_ms: FloatArray) -> FloatArray:
-    """How much later than the promptest each scan arrived; two clocks may run at unlike rates."""
-    if len(arrived_ms) < 3 or not np.ptp(device_ms):  # of a protocol without a clock
-        return np.zeros(0)
-    device_ms, arrived_ms = device_ms - device_ms[0], arrived_ms - arrived_ms[0]
-    rate = np.polyfit(device_ms, arrived_ms, 1)[0]
-    late = arrived_ms - rate * device_ms
-    return np.asarray(late - late.min())
-
-
-def _period(device_ms: FloatArray, counters: list[int]) -> float | None:
-    steps = np.diff(np.array(counters, dtype=np.int64))
-    spans = np.diff(device_ms)[steps == 1]
-    return float(np.median(spans)) or None if len(spans) else None
 
 
 def of_recording(recording: Recording, description: str | None, frames: slice | None) -> Evidence:
@@ -279,24 +244,10 @@ def _scans_of_port(recording: Recording, port: int) -> list[_Taken]:
 
 
 def _heard_on_ports(recording: Recording, ports: list[list[_Taken]]) -> Heard:
-    delays, periods, lost = [], [], 0
-    for port in ports:
-        for channel in {scan.channel for scan in port}:
-            scans = [scan for scan in port if scan.channel is channel]
-            device_ms = np.array([scan.device_us for scan in scans]) * 1e-3
-            counters = [scan.counter for scan in scans]
-            lost = max(lost, _gaps(counters))
-            delays.append(_delays(np.array([s.arrived_ns for s in scans]) * 1e-6, device_ms))
-            periods.append(_period(device_ms, counters))
-    known = [period for period in periods if period is not None]
-    return Heard(
-        recording.summary.packets,
-        recording.summary.corrupt,
-        recording.summary.faulty,
-        lost,
-        np.concatenate(delays) if delays else np.zeros(0),
-        min(known) if known else None,
-    )
+    channels = [(port, channel) for port in ports for channel in {scan.channel for scan in port}]
+    lost = [_gaps([s.counter for s in port if s.channel is channel]) for port, channel in channels]
+    summary = recording.summary
+    return Heard(summary.packets, summary.corrupt, summary.faulty, max(lost, default=0))
 
 
 def of_arrays(

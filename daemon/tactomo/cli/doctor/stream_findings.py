@@ -1,10 +1,9 @@
-"""What `tactomo doctor` finds about the way of the scans: the line, the latency, the frames."""
+"""What `tactomo doctor` finds about the way of the scans: the line and the frames."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from tactomo_models.health.findings import Finding, Level
 
 from tactomo.cli.doctor.evidence import Evidence, Heard
@@ -16,12 +15,10 @@ FEWEST_LOST = 3  # below that it is no rate: one of the first 41 says little of 
 
 
 def stream_findings(evidence: Evidence) -> list[Finding]:
-    """Return what was found about line, latency and frames; empty for a file of arrays."""
+    """Return what was found about line and frames; empty for a file of arrays."""
     found: list[Finding] = []
     if evidence.heard is not None:
         found += [_packets_found(evidence.heard), _lost_found(evidence, evidence.heard.lost)]
-    if len(evidence.ages_ms):
-        found.append(_latency_found(evidence))
     if evidence.frames:
         found.append(_pressed_found(evidence))
     return [*found, *_issues_found(evidence)]
@@ -71,38 +68,6 @@ def _lost_found(evidence: Evidence, lost: int) -> Finding:
         else "is the line too slow for the rate, or the computer too busy?",
         figures,
     )
-
-
-def _latency_found(evidence: Evidence) -> Finding:
-    p50, p99 = np.percentile(evidence.ages_ms, (50, 99))
-    heard = evidence.heard
-    period_ms = heard.period_ms if heard is not None else None
-    parts = {name: float(times["p50"]) for name, times in _stages(evidence).items()}
-    if heard is not None and len(heard.delay_ms):
-        # Reading waits for the other channel's scan, too: the later one of the two counts.
-        parts = {"transport and sync": float(np.median(heard.delay_ms)), **parts}
-    where = ", ".join(f"{name} {ms:.1f}" for name, ms in parts.items())
-    detail = f"age when published p50 {p50:.1f} ms, p99 {p99:.1f} ms"
-    if period_ms is not None:
-        detail += f", against {period_ms:.0f} ms from scan to scan"
-    level, step = Level.OK, ""
-    if period_ms is not None and p99 > period_ms:
-        level = Level.FAULT if p50 > period_ms else Level.ADVICE
-        step = "set a budget (`tactomo method auto --budget-ms`), or free the processor"
-    return Finding(
-        "latency",
-        level,
-        f"{detail}; where it goes (p50, ms): {where or 'not known'}",
-        step,
-        {"p50_ms": float(p50), "p99_ms": float(p99), "period_ms": period_ms}
-        | {f"{name.replace(' ', '_')}_ms": ms for name, ms in parts.items()},
-    )
-
-
-def _stages(evidence: Evidence) -> dict[str, Any]:
-    """The times of the daemon's stages that follow one another; others are parts of these."""
-    stages = evidence.after.get("stage_ms") or {}
-    return {name: stages[name] for name in ("reconstruct", "publish") if name in stages}
 
 
 def _pressed_found(evidence: Evidence) -> Finding:

@@ -113,13 +113,10 @@ def _setting(text: str) -> tuple[str, Any]:
         "tactomo replay grasp.mcap --viewer",
         "tactomo replay grasp.mcap --speed 0.25",
         "tactomo replay grasp.mcap --speed max --record frames.mcap",
-        "tactomo replay ~/.local/share/tactomo/recordings --speed 10",
     )
 )
 def replay(
-    recording: Annotated[
-        Path, typer.Argument(help="A recording (.mcap), or a folder of those a daemon has cut.")
-    ],
+    recording: options.RecordingFile,
     speed: Annotated[
         str, typer.Option(help="Factor of the recorded speed, or max: as fast as reconstructed.")
     ] = "1.0",
@@ -156,18 +153,17 @@ def replay(
     The recorded bytes take the way of live bytes, so the maps equal those of the live run. Without
     --viewer and --stay, the replay ends with the recording.
 
-    A folder of files that a daemon has cut is played as one recording, from the oldest to the
-    newest; pauses between files are shortened to a second.
+    Each file of a recording that a daemon has cut into several is played by itself.
 
     With --viewer, the replay shows its first frame and waits until a browser opens the page. The
     page, or the command `replay` of the control socket, pauses, steps, moves and slows the replay.
     """
     from tactomo.cli.run.demo import free_of, show_replay
-    from tactomo.recordings.recording_set import RecordingSet, open_replayable
+    from tactomo.recordings.recording import open_recording
 
     factor = _speed(speed)
     stream, control = free_of((stream, options.DEFAULT_STREAM), (control, options.DEFAULT_CONTROL))
-    opened = open_replayable(recording)
+    opened = open_recording(recording)
     origin = opened.origin
     if with_viewer:
         if record is not None:
@@ -197,8 +193,7 @@ def replay(
         exit_at_end=not stay,
         recording={"file": record, "maps": record is not None},
     )
-    for part in opened.parts if isinstance(opened, RecordingSet) else [opened]:
-        warn_of_damage(part)
+    warn_of_damage(opened)
 
     def begin(playback: Playback) -> None:
         playback.steer(paused or wait_for_page, None, loop)
