@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from tactomo.cli import options
 from tactomo.cli.commands import Group
-from tactomo.cli.output import say, table
+from tactomo.cli.output import say
 from tactomo.cli.plot.plot import picture_option
 
 from tactomo_lab.commands.report import (
@@ -23,15 +22,11 @@ from tactomo_lab.commands.report import (
     print_suite,
     shown,
     tell,
-    usable,
 )
 
 if TYPE_CHECKING:
-    from rich.table import Table
-    from rich.text import Text
     from tactomo.cli.console import Console
 
-    from tactomo_lab.evaluation.stability import Trust
     from tactomo_lab.scenes.measures import Score, Summary
 
 MAPS = ("frames", "ICC", "worst", "shape", "RIE", "flagged", "wrong", "ms", "p99")
@@ -49,7 +44,6 @@ DAYS = (
     *("distrusted", "refused", "firm Δσ"),
 )
 FEWER = 10  # frames without tracking are slow, for all that they show
-NAME_WIDTH, CELL_WIDTH = 17, 16  # characters of the first and of the other columns of regimes
 
 SnrOf = Annotated[
     Literal["change", "voltage"],
@@ -186,13 +180,16 @@ def _decibels(text: str) -> list[float]:
         "tactomo evaluate field --seeds reporting --count 50 --json > field.json",
         "tactomo evaluate field --rows soft --picture soft_press.png",
         "tactomo evaluate field --rows graded,mixed --companion 0.05",
+        "tactomo evaluate field --rows regimes --method auto,fit --picture flags.png",
     )
 )
 def field(
     seeds: Seeds = "tuning",
     count: Annotated[int, typer.Option(min=1, help="Scenes of each line.")] = 10,
-    rows: Annotated[str | None, typer.Option(help="Which rows, with commas. [all of them]")] = None,
-    method: options.Method = "auto",
+    rows: Annotated[
+        str | None, typer.Option(help="Which rows, with commas; or regimes. [all below]")
+    ] = None,
+    method: Annotated[list[str] | None, options.methods_option(" [auto]")] = None,
     sensor: options.Description = options.DEFAULT_DESCRIPTION,
     companion: Annotated[
         float | None,
@@ -204,7 +201,10 @@ def field(
     ] = None,
     picture: Annotated[
         Path | None,
-        picture_option("Draw one soft contact, the middle one by correlation: truth and method"),
+        picture_option(
+            "Draw one soft contact, the middle one by correlation: truth and method; of several "
+            "methods, an overview of all rows"
+        ),
     ] = None,
     as_json: options.JsonOutput = False,
 ) -> None:
@@ -221,47 +221,68 @@ def field(
     that land, glide, change pressure and lift, with noise 40 dB below each frame's change or 60 dB
     below the voltages. *palm*: one contact at least 60 mm across, of 2
     to 200 kPa, which comes in a second to ten minutes while the reference follows. *overload*: one
-    to three presses, the first or all beyond the end of the response table. Scenes are simulated as
-    in `tactomo evaluate scenes`; still scenes are reconstructed from a cold start. The first run
-    simulates (a second a scene, a minute a sequence, 10 s a palm) and keeps the voltages in the
-    cache. Rows that the sensor cannot have, such as *overload* without a magnitude channel, are
-    left out.
+    to three presses, the first or all beyond the end of the response table. *regimes*: a row for
+    each regime where methods fail: noise, small contacts, bad leads, drift, a stretched sheet,
+    jumps and more; the last frame of a case counts. A map is bad where its correlation is below
+    0.7, and flagged if it has one of the flags misfit_high, not_converged, low_confidence,
+    reference_mismatch, noise_high and channels_swapped, or if there is no map.
+
+    Scenes are simulated as in `tactomo evaluate scenes`; still scenes are reconstructed from a cold
+    start. The first run simulates (a second a scene, a minute a sequence, 10 s a palm) and keeps
+    the voltages in the cache. Rows that the sensor cannot have, such as *overload* without a
+    magnitude channel, are left out.
     """
     from tactomo_models import ModelError, load_description
 
-    from tactomo_lab.commands.pictures import draw_press
+    from tactomo_lab.commands.pictures import draw_overview, draw_press
     from tactomo_lab.evaluation.field import ROWS, STILL_ROWS, middle_press, scores_of_row
-    from tactomo_lab.evaluation.regimes import can_happen
+    from tactomo_lab.evaluation.regimes import REGIMES, can_happen
     from tactomo_lab.scenes.measures import summarise
 
-    description = load_description(sensor)
-    scores: dict[str, list[Score]] = {}
-    chosen = chosen_names(rows, ROWS if companion is None else STILL_ROWS, "--rows")
-    if rows is None:
-        chosen = [row for row in chosen if can_happen(row, description)]
-    for row in chosen:
+    description, methods = load_description(sensor), method or ["auto"]
+    usual = ROWS if companion is None else STILL_ROWS
+    if rows in (None, "regimes"):
+        all_rows = usual if rows is None else REGIMES
+        chosen = [row for row in all_rows if can_happen(row, description)]
+    else:
+        known = [*usual, *(REGIMES if companion is None else ())]
+        chosen = chosen_names(rows, dict.fromkeys(known), "--rows")
+    by_line: dict[str, dict[str, list[Score]]] = {}
+    for row, one in product(chosen, methods):
         total = count if row in STILL_ROWS else None
-        lines_of = scores_of_row(description, row, method, seeds, count, companion)
+        lines_of = scores_of_row(description, row, one, seeds, count, companion)
         for line, frames in lines_of.items():
             try:
-                scores[line] = list(shown(frames, total, line))
+                by_line.setdefault(line, {})[one] = list(shown(frames, total, line))
             except ModelError as error:  # of a row's own sensor, for which a method may not serve
                 say(f"left out: {line}: {error}", err=True)
+    scores = {
+        line if len(methods) == 1 else f"{line}, {one}": own
+        for line, by_method in by_line.items()
+        for one, own in by_method.items()
+    }
     settings = _settings(
-        description.name, seeds, snr_of="change", method=method, companion=companion
+        description.name, seeds, snr_of="change", method=", ".join(methods), companion=companion
     )
     found: dict[str, Summary] = {line: summarise(own) for line, own in scores.items()}
     lines = {
-        line: {**asdict(found[line]), "scores": [asdict(one) for one in own]}
+        line: {**asdict(found[line]), "scores": [one.as_json() for one in own]}
         for line, own in scores.items()
     }
+
+    def draw(output: Path) -> None:
+        if len(methods) > 1:
+            draw_overview(by_line, methods, output)
+        else:
+            draw_press(middle_press(description, methods[0], seeds, count), output)
+
     tables = {"maps": FIELD_MAPS, "contacts": FIELD_CONTACTS}
     tell(
         {**settings, "scenes_each": count, "lines": lines},
         as_json,
         lambda console: print_suite(console, _in_words(settings), tables, found),
         picture,
-        lambda output: draw_press(middle_press(description, method, seeds, count), output),
+        draw,
     )
 
 
@@ -318,101 +339,3 @@ def drift(
         picture,
         lambda output: draw_picture(days[0][0], days[0][1], output),
     )
-
-
-# ------------------------------------------------------------------ where methods fail
-
-
-@app.command(
-    epilog=options.examples(
-        "tactomo evaluate stability --count 2",
-        "tactomo evaluate stability --regime jump,drift --picture flags.png",
-        "tactomo evaluate stability --seeds reporting --jobs 2 --json > stability.json",
-    )
-)
-def stability(
-    seeds: Seeds = "tuning",
-    count: Annotated[int, typer.Option(min=1, help="Cases of each regime.")] = 6,
-    regime: Annotated[
-        str | None, typer.Option(help="Which regimes, with commas. [all of them]")
-    ] = None,
-    method: Annotated[list[str] | None, options.methods_option(" [all that are available]")] = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
-    sensor: options.Description = options.DEFAULT_DESCRIPTION,
-    picture: Annotated[Path | None, picture_option("Draw an overview")] = None,
-    as_json: options.JsonOutput = False,
-) -> None:
-    """Reconstruct scenes in regimes where methods fail, and count bad maps without a flag.
-
-    The regimes are noise, small contacts, many contacts, bad leads, drift, a stretched sheet, jumps
-    and more; every method reconstructs some simulated cases of each regime. A map is bad where its
-    ICC is below 0.7. A map counts as flagged if it has one of the flags misfit_high, not_converged,
-    low_confidence, reference_mismatch, noise_high and channels_swapped, or if there is no map.
-    Regimes that the sensor cannot have, such as lost structure scans of one sheet, are left out.
-    The first run simulates (a second a case, longer for several frames) and keeps the voltages in
-    the cache.
-    """
-    from tactomo_models import available_methods, load_description
-
-    from tactomo_lab.commands.pictures import draw_overview
-    from tactomo_lab.evaluation.regimes import REGIMES, can_happen
-    from tactomo_lab.evaluation.stability import evaluate_regimes, trust_by_regime
-
-    description = load_description(sensor)
-    regimes = chosen_names(regime, REGIMES, "--regime")
-    if regime is None:
-        regimes = [name for name in regimes if can_happen(name, description)]
-    chosen = method or usable(description, available_methods())
-    cases = evaluate_regimes(description, regimes, chosen, seeds, count, jobs=jobs)
-    total = len(regimes) * count
-    scores = [one for case in shown(cases, total, f"{seeds} cases") for one in case]
-    by_regime = trust_by_regime(scores)
-    told = {
-        **_settings(description.name, seeds, cases_each=count, methods=chosen),
-        "regimes": {
-            name: {
-                "what": REGIMES[name].what if name in REGIMES else "all of these regimes",
-                "methods": {of: asdict(counts) for of, counts in by_method.items()},
-            }
-            for name, by_method in by_regime.items()
-        },
-        "cases": [one.as_json() for one in scores],
-    }
-
-    def show(console: Console) -> None:
-        what = f"{description.name}, {seeds} seeds, {count} case(s) of each regime"
-        console.print(f"Simulated, not measured: {what}.")
-        _print_regimes(console, by_regime)
-
-    tell(told, as_json, show, picture, partial(draw_overview, by_regime))
-
-
-def _print_regimes(console: Console, rows: dict[str, dict[str, Trust]]) -> None:
-    fit = max(1, (console.width - NAME_WIDTH) // CELL_WIDTH)
-    methods = list(rows["all"])
-    for first in range(0, len(methods), fit):  # as many tables as the terminal is too narrow for
-        console.print(_counts(rows, methods[first : first + fit]))
-    console.print(
-        "Each cell: mean ICC; bad maps (ICC < 0.7) without a flag that tells to distrust, of "
-        "all bad ones; good maps with one, of all good ones. --json tells what every method did.",
-        style="dim",
-    )
-
-
-def _counts(rows: dict[str, dict[str, Trust]], methods: Sequence[str]) -> Table:
-    made = table("", *methods)
-    for regime, by_method in rows.items():
-        if regime == "all":
-            made.add_section()
-        made.add_row(regime, *(_trust(by_method[method]) for method in methods))
-    return made
-
-
-def _trust(counts: Trust) -> Text:
-    from rich.text import Text
-
-    if not counts.maps:  # the method does not serve this regime's sensor
-        return Text("-")
-    silent = Text(f"{counts.bad_unwarned}/{counts.bad}", "red" if counts.bad_unwarned else "")
-    good = f" {counts.good_warned}/{counts.maps - counts.bad}"
-    return Text(f"{counts.icc:.2f} ").append_text(silent).append(good)

@@ -12,13 +12,15 @@ import numpy as np
 from tactomo.cli.plot.plot import save_figure
 from tactomo_models.scene.press import strongest
 
+from tactomo_lab.scenes.measures import mean
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
     from tactomo_models import SensorDescription
 
     from tactomo_lab.evaluation.drifting import Day, Seen
     from tactomo_lab.evaluation.play import Outcome
-    from tactomo_lab.evaluation.stability import Trust
+    from tactomo_lab.scenes.measures import Score
 
 ROWS = 4  # scenes of each kind
 CHANGE = "|Δσ|/σ₀"
@@ -113,30 +115,35 @@ def draw_press(
     save_figure(figure, output)
 
 
-def draw_overview(rows: dict[str, dict[str, Trust]], output: Path) -> None:
-    """Draw regimes by methods: mean ICC as colour, and how many bad maps nothing warned of.
+def draw_overview(
+    by_line: dict[str, dict[str, list[Score]]],  # scores of each line by each method
+    methods: Sequence[str],
+    output: Path,
+) -> None:
+    """Draw lines by methods: mean ICC as colour, and how many bad maps nothing warned of.
 
     Raises TactomoError where the picture cannot be written.
     """
     from matplotlib.figure import Figure
 
-    methods = list(rows["all"])
-    icc = np.array([[counts.icc for counts in row.values()] for row in rows.values()])
+    of_all = {one: [s for row in by_line.values() for s in row.get(one, ())] for one in methods}
+    rows = [[row.get(one, []) for one in methods] for row in (*by_line.values(), of_all)]
+    icc = np.array([[mean(s.likeness for s in scores) for scores in row] for row in rows])
     size = (2.8 + 1.05 * len(methods), 1.9 + 0.3 * len(rows))
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots()
     image = axes.imshow(icc, vmin=0, vmax=1, cmap="viridis", aspect="auto")
     axes.set_xticks(range(len(methods)), methods, rotation=30, ha="left", rotation_mode="anchor")
-    axes.set_yticks(range(len(rows)), list(rows))
+    axes.set_yticks(range(len(rows)), [*by_line, "all"])
     axes.tick_params(top=True, bottom=False, labeltop=True, labelbottom=False, length=0)
     axes.axhline(len(rows) - 1.5, color="white", linewidth=3)
-    for row, by_method in enumerate(rows.values()):
-        for column, counts in enumerate(by_method.values()):
-            ink = "black" if counts.icc > 0.6 else "white"
-            icc_shown = f"{counts.icc:.2f}" if counts.maps else ""
+    for row, of_methods in enumerate(rows):
+        for column, scores in enumerate(of_methods):
+            ink = "black" if icc[row, column] > 0.6 else "white"
+            icc_shown = f"{icc[row, column]:.2f}" if scores else ""
             axes.text(column - 0.44, row, icc_shown, va="center", fontsize=8, color=ink)
-            if counts.bad_unwarned:
-                _mark(axes, column + 0.44, row, f"{counts.bad_unwarned}/{counts.maps}")
+            if silent := sum(one.bad and not one.warned for one in scores):
+                _mark(axes, column + 0.44, row, f"{silent}/{len(scores)}")
     figure.colorbar(image, ax=axes, label="mean ICC with the truth", aspect=30)
     legend = (
         "Red: maps with an ICC below 0.7 that no flag told to distrust, of all maps. "

@@ -2,7 +2,8 @@
 
 Still scenes, each reconstructed from a cold start and run to its end, and moving ones. The rows of
 ordinary scenes, rectangles and rings are `still_scenes`'; each of the others is the regime of that
-name.
+name, of which the last frame counts. What counts is what a user is told: a bad map with no flag of
+`DISTRUST` is a silent failure, a good one with such a flag a false alarm.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from tactomo_lab.evaluation.moving import (
     palm_sequence,
 )
 from tactomo_lab.evaluation.play import Outcome, play
-from tactomo_lab.evaluation.regimes import make_case
+from tactomo_lab.evaluation.regimes import REGIMES, make_case
 from tactomo_lab.scenes.case import Case, with_companion
 from tactomo_lab.scenes.drawing import SeedSet
 from tactomo_lab.scenes.measures import Score
@@ -57,16 +58,24 @@ def scores_of_row(
     count: int,
     companion: float | None = None,
 ) -> dict[str, Iterator[Score]]:
-    """Frames of one of `ROWS` as a method reconstructs them, by the name of their line.
+    """Frames of one of `ROWS`, or of a regime, as a method has them, by the name of their line.
 
     Without those whose scan is lost, for a map of half a measurement is another question, and those
-    in which a palm is still to come. `count` is as `cases_of_row` has it. `companion` is the
-    relative error of a load cell under the sheet; None for none.
+    in which a palm is still to come; of a regime's case the last frame. `count` is as
+    `cases_of_row` has it. `companion` is the relative error of a load cell under the sheet; None
+    for none.
 
     Raises:
         DataError: the row cannot happen to the sensor, or has no room on it.
         ModelError: the method is not to be had for this sensor, or is the user's own and failed.
     """
+
+    def counts(outcome: Outcome) -> bool:
+        frame, case = outcome.frame, outcome.case
+        if row in REGIMES and row not in MOVING_ROWS:
+            return frame is case.frames[-1]
+        return frame.scans.keys() >= set(case.description.channels) and frame.phase != COMING
+
     return {
         line: (
             outcome.score
@@ -74,8 +83,7 @@ def scores_of_row(
                 cases if companion is None else (with_companion(case, companion) for case in cases),
                 method,
             )
-            if outcome.frame.scans.keys() >= set(outcome.case.description.channels)
-            and outcome.frame.phase != COMING
+            if counts(outcome)
         )
         for line, cases in cases_of_row(description, row, seed_set, count).items()
     }
@@ -84,7 +92,7 @@ def scores_of_row(
 def cases_of_row(
     description: SensorDescription, row: str, seed_set: SeedSet, count: int
 ) -> dict[str, Iterator[Case]]:
-    """Cases of one of `ROWS`, by the name of their line; the same ones every time.
+    """Cases of one of `ROWS` or `REGIMES`, by the name of their line; the same ones every time.
 
     `count` is of the scenes of each line, palms too; of other moving ones there is one for
     `SCENES_A_SEQUENCE`.

@@ -175,7 +175,7 @@ class Score:
     @property
     def bad(self) -> bool:
         """Whether its map should have been flagged."""
-        return self.icc < BAD_ICC
+        return self.likeness < BAD_ICC
 
     @property
     def likeness(self) -> float:
@@ -463,8 +463,8 @@ def summarise(scores: Sequence[Score]) -> Summary:
         force_error=mean(abs(one.force_error) for one in scores if one.groups == 1),
         force_error_several=mean(abs(one.force_error) for one in scores if one.groups > 1),
         distrusted=mean(one.distrusted for one in scores),
-        bad_unflagged=mean(one.bad and not one.distrusted for one in scores),
-        good_flagged=mean(one.distrusted for one in scores if not one.bad),
+        bad_unflagged=mean(one.bad and not one.warned for one in scores),
+        good_flagged=mean(one.warned for one in scores if not one.bad),
         confidently_wrong=mean(one.confidently_wrong for one in scores),
         seconds=percentile(seconds, 50),
         seconds_99=percentile(seconds, 99),

@@ -31,7 +31,7 @@ def test_scenes_in_numbers(tactomo: Run, tmp_path: Path) -> None:
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("command", ["scenes", "field", "stability", "drift"])
+@pytest.mark.parametrize("command", ["scenes", "field", "drift"])
 @pytest.mark.parametrize(
     ("picture", "told"),
     [("scenes.txt", "not a kind of picture"), ("nowhere/scenes.png", "there is no folder nowhere")],

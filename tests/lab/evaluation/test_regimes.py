@@ -8,18 +8,12 @@ from itertools import combinations
 import numpy as np
 import pytest
 from made_score import made_score
-from tactomo_lab.evaluation.play import Played, Player, Variant
+from tactomo_lab.evaluation.field import scores_of_row
+from tactomo_lab.evaluation.play import Played, Player, Variant, play
 from tactomo_lab.evaluation.regimes import KINDS, REGIMES, draw_plan, make_case
-from tactomo_lab.evaluation.stability import (
-    Judged,
-    Trust,
-    evaluate_regimes,
-    judge,
-    trust,
-    trust_by_regime,
-)
 from tactomo_lab.scenes.case import Case, Plan
 from tactomo_lab.scenes.drawing import BOTH_CHANNELS, gap_m, outline_of
+from tactomo_lab.scenes.measures import Score, summarise
 from tactomo_lab.scenes.simulation import (
     SheetState,
     UnevenSkin,
@@ -242,9 +236,9 @@ def last_of(method: str, case: Case) -> Played:
     return last
 
 
-def score_of(case: Case) -> Judged:
-    (judged,) = judge("a", case, ["tikhonov"])
-    return judged
+def score_of(case: Case) -> Score:
+    *_, last = play([case], "tikhonov")
+    return last.score
 
 
 @pytest.mark.slow
@@ -274,13 +268,12 @@ def test_a_case_is_judged_by_its_last_frame(
     small: SensorDescription, small_artifact: Artifact
 ) -> None:
     case = case_of(small, "jump")
-    score = score_of(case).score
+    (score,) = scores_of_row(small, "jump", "tikhonov", "tuning", 1)["jump"]
     alone = Reconstructor(case.description, small_artifact, method="tikhonov")
     alone.set_reference(case.tare)
     scans = case.frames[-1].scans
     frame = alone.reconstruct(scans[Channel.MAGNITUDE], scans[Channel.STRUCTURE])
     assert frame.map is not None
-    np.testing.assert_array_equal(last_of("tikhonov", case).made.map, frame.map)
     expected = np.corrcoef(frame.map.ravel(), case.truth.map.ravel())[0, 1]
     assert score.icc == pytest.approx(expected)
     assert score.groups == len(case.plan.frames[-1])
@@ -294,59 +287,31 @@ def test_what_is_right_where_the_magnitude_channel_shows_nothing(small: SensorDe
     shape = last_of("tikhonov", light).made.structure
     assert shape is not None
     expected = np.corrcoef(shape.ravel(), light.truth.pressed.ravel())[0, 1]
-    assert score_of(light).score.likeness == pytest.approx(expected)
+    assert score_of(light).likeness == pytest.approx(expected)
     drifted = case_of(small, "drift-at-rest")
-    ghosts = score_of(drifted).score
+    ghosts = score_of(drifted)
     assert (ghosts.likeness == 0) is (ghosts.found > 0)
     rest = {name: getattr(drifted.tare, name) for name in BOTH_CHANNELS}
     still = replace(drifted, frames=[replace(drifted.frames[0], scans=rest)])
-    assert score_of(still).score.likeness == 1
+    assert score_of(still).likeness == 1
     ordinary = case_of(small, "ordinary")
     absent = score_of(replace(ordinary, frames=[replace(ordinary.frames[0], scans={})]))
-    assert absent.is_bad
-    assert absent.score.warned
+    assert absent.bad
+    assert absent.warned
 
 
-def one(icc: float, flags: tuple[str, ...] = (), has_map: bool = True) -> Judged:
-    return Judged("a", "auto", made_score(icc=icc, icc_structure=icc, flags=flags, has_map=has_map))
+def one(icc: float, flags: tuple[str, ...] = (), has_map: bool = True) -> Score:
+    return made_score(icc=icc, icc_structure=icc, flags=flags, has_map=has_map)
 
 
 def test_warnings_are_counted() -> None:
     lead = ("electrode_fault",)
-    scores = [
-        *(one(0.69), one(0.2, flags=lead), one(0.1, flags=("misfit_high",))),
-        *(one(0.7), one(0.9, flags=lead), one(0.8, has_map=False), one(0.95)),
-    ]
-    counted = trust(scores)
-    assert counted.icc == pytest.approx(4.34 / 7)
-    assert counted == Trust(7, counted.icc, 3, 2, 1, 1, 2)
-    scores += [one(0.3)._replace(regime="b", method="fit")]
-    by_regime = trust_by_regime(scores)
-    assert list(by_regime) == ["a", "b", "all"]
-    assert by_regime["a"]["auto"] == counted
-    assert by_regime["b"]["fit"].bad_unwarned == by_regime["all"]["fit"].bad_unwarned == 1
-
-
-def test_a_regime_may_have_a_sensor_that_a_method_does_not_serve(small: SensorDescription) -> None:
-    methods = ("tikhonov", "network")  # which needs both channels
-    ((score,),) = evaluate_regimes(small, ["graded"], methods, "tuning", 1)
-    assert score.method == "tikhonov"
-
-
-@pytest.mark.long
-def test_more_processes_do_the_same(small: SensorDescription) -> None:
-    regimes, methods = ("near-touch", "dead-lead"), ("tikhonov", "auto")
-    alone, shared = (
-        list(evaluate_regimes(small, regimes, methods, "tuning", 2, jobs=jobs)) for jobs in (1, 2)
+    counted = summarise(
+        [
+            *(one(0.69), one(0.2, flags=lead), one(0.1, flags=("misfit_high",))),
+            *(one(0.7), one(0.9, flags=lead), one(0.8, has_map=False), one(0.95)),
+        ]
     )
-    told = [
-        [each.as_json() | {"seconds": 0} for case in cases for each in case]
-        for cases in (alone, shared)
-    ]
-    assert repr(told[0]) == repr(told[1])  # an unknown confidence is NaN, which equals nothing
-    assert [case[0].score.scene for case in alone] == [
-        "tuning 2/0",
-        "tuning 2/1",
-        "tuning 1/0",
-        "tuning 2/1",
-    ]
+    assert counted.icc == pytest.approx(4.34 / 7)
+    assert counted.bad_unflagged == pytest.approx(2 / 7)
+    assert counted.good_flagged == pytest.approx(1 / 4)

@@ -1,0 +1,57 @@
+"""`tactomo evaluate field --rows regimes`: what is asked for is evaluated, drawn and counted."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from small_sensor import SMALL
+
+Run = Callable[..., Any]
+
+
+@pytest.fixture
+def field(tactomo: Run, tmp_path: Path) -> Callable[..., Any]:
+    sensor = tmp_path / "small.toml"
+    sensor.write_text(SMALL)
+    return lambda *more: tactomo("evaluate", "field", "--description", sensor, *more)
+
+
+@pytest.mark.slow
+def test_in_numbers_words_and_pictures(field: Run, tmp_path: Path) -> None:
+    picture = tmp_path / "flags.png"
+    some = ("--rows", "dead-lead,drift-at-rest", "--method", "tikhonov,network,auto")
+    numbers = field(*some, "--count", 1, "--json", "--picture", picture)
+    assert numbers.returncode == 0, numbers.stderr
+    assert "left out: dead-lead" in numbers.stderr  # nobody has trained a network for it
+    told = json.loads(numbers.stdout)
+    assert (told["simulated"], told["seeds"], told["sensor"]) == (True, "tuning", "small")
+    both = [f"{row}, {of}" for row in ("dead-lead", "drift-at-rest") for of in ("tikhonov", "auto")]
+    assert list(told["lines"]) == both
+    for line, facts in told["lines"].items():
+        (score,) = facts["scores"]
+        assert ("electrode_fault" in score["flags"]) is line.startswith("dead-lead")
+        assert facts["bad_unflagged"] == (score["likeness"] < 0.7 and not score["warned"])
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    words = field(*some, "--count", 1)
+    assert words.returncode == 0
+    assert "Simulated, not measured: small, tuning seeds" in words.stdout
+    assert "dead-lead, auto" in words.stdout
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "why"),
+    [
+        ("--rows", "earthquake", "'earthquake': give one or more of"),
+        ("--method", "magic", "unknown method 'magic'"),
+    ],
+)
+def test_what_it_does_not_know_is_a_usage_error(
+    field: Run, option: str, value: str, why: str
+) -> None:
+    result = field(option, value)
+    assert result.returncode == 2
+    assert why in result.stderr
