@@ -557,8 +557,8 @@ def test_status_is_shown_part_by_part_and_foreign_text_stays_text(page: Page) ->
     assert channels[:2] == ["magnitude", "no scans"]
     assert "20.0 scans/s" in channels
     assert "/dev/ttySKIN" in channels
-    assert channels[channels.index("cell") + 1] == "255.5: 127.0 ± 2.5 N, fitted"
-    assert channels[channels.index("pad") + 1] == "missing"
+    assert channels[channels.index("cell") + 1] == "reads 255.5: 127.0 ± 2.5 N, fitted"
+    assert channels[channels.index("pad") + 1] == "no reading within its limits"
     assert page["reference"].text.startswith("Reference of 20 scans")
     assert page["record"].text == "Stop · 1.5 MB"
     assert page["source"].text == "simulated skin"
@@ -863,6 +863,7 @@ REPLAY = {
     "paused": False,
     "loop": False,
     "waits_for_page": False,
+    "exact": True,
     "maps_before": 0,
 }
 
@@ -871,6 +872,7 @@ REPLAY = {
 def test_a_replay_is_steered_by_the_page(page: Page) -> None:
     page.open()
     assert not page["replay"].is_displayed()
+    assert page["tare"].is_enabled()
     page.skin.status |= {"source": {"kind": "replay"}, "replay": REPLAY}
     page.daemon.answers["replay"] = REPLAY
     wait_until(lambda: page["replay"].is_displayed())
@@ -880,6 +882,8 @@ def test_a_replay_is_steered_by_the_page(page: Page) -> None:
     page.skin.status |= {"state": "paused", "replay": REPLAY | {"paused": True}}
     page.skin.sends_frames = False
     wait_until(lambda: page.health == "replay-paused")
+    assert page.banner == "The replay is paused. The map shows the frame at the slider."
+    assert not page["tare"].is_enabled()  # it goes by the references that were recorded
     assert page["state"].text == "replay paused"
     assert page["position-text"].text == "2.0 / 40.0 s"
     assert "scans/s" not in page["channels"].text  # none come, whatever came while it moved
@@ -894,6 +898,7 @@ def test_a_replay_is_steered_by_the_page(page: Page) -> None:
     wait_until(lambda: "stale" in page.map_classes)
     page.skin.sends_frames = True  # of where it stands now
     wait_until(lambda: page.health == "replay-paused")
+    wait_until(lambda: "may differ from the recorded ones" in page.banner)
     page.skin.sends_frames = False
     page.daemon.answers["replay"] = ControlError("the recording ends there", "", "bad_request")
     page["position"].send_keys(Keys.HOME)
@@ -1040,7 +1045,7 @@ def test_stale_data_are_told_and_come_back(page: Page) -> None:
     page.skin.sends_frames = False
     wait_until(lambda: page.health == "stale")
     wait_until(lambda: page["readout"].text.endswith(" mm"))  # of before: nobody knows it now
-    assert page.banner.startswith("Stale. The newest scan is ")
+    assert page.banner.startswith("Stale. The newest frame is ")
     assert page["state"].text == "stale"
     wait_until(lambda: page.map_classes == {"pressable", "stale"})
     wait_until(lambda: page["no-contacts"].text == "Not known.")  # and not "Nothing pressed."

@@ -56,12 +56,11 @@ def map_pixels(frame: Frame, description: Mapping[str, Any]) -> NDArray[np.uint8
 
 def companion_words(companion: Mapping[str, Any]) -> str:
     """Return what a companion reads, and whether it is believed, of an entry of `companions`."""
-    state, force_n = str(companion["state"]), companion["force_n"]
-    believed = COMPANION_STATES.get(state, state)
-    if force_n is None:
+    read = [companion[key] for key in ("reading", "force_n", "force_sigma_n")]
+    believed = COMPANION_STATES.get(companion["state"], str(companion["state"]))
+    if None in read:
         return believed
-    sigma_n = companion["force_sigma_n"]
-    return f"reads {companion['reading']:g}: {force_n:z.1f} ± {sigma_n:.1f} N, {believed}"
+    return f"reads {read[0]:g}: {read[1]:z.1f} ± {read[2]:.1f} N, {believed}"
 
 
 def shown_image(

@@ -701,6 +701,9 @@ class Replay:
     paused: bool = False
     loop: bool = False
     waits_for_page: bool = False  #: paused until a viewer's page is open
+    #: whether frames are made of the dual scans and the references that the live ones were made of;
+    #: ``tare`` is then refused
+    exact: bool = False
     #: `sequence` of the last ``map`` message before the replay moved: later maps are of the new
     #: position
     maps_before: int = 0

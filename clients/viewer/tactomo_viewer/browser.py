@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import json
 import time
 import uuid
@@ -17,6 +18,7 @@ from typing import Any
 
 from aiohttp import WSMessage, WSMsgType, web
 from tactomo_client import ClientError, ControlError, aio
+from tactomo_client.appearance import companion_words
 
 from tactomo_viewer.feed import Feed
 from tactomo_viewer.wire import frame_message, json_text
@@ -110,7 +112,10 @@ class Browser:
             await self._send("twin", **twin)
         status = self._feed.status
         if status is not None and self._is_new(status):
-            await self._send("status", age_ms=status.age_s * 1e3, status=status.fields)
+            read = status.companions.items()
+            words = {name: companion_words(dataclasses.asdict(each)) for name, each in read}
+            fields = {**status.fields, "companion_words": words}
+            await self._send("status", age_ms=status.age_s * 1e3, status=fields)
         for heard in [e for e in self._feed.events if e.number > self._last_event]:
             self._last_event = heard.number
             age_ms = (time.monotonic() - heard.heard_s) * 1e3

@@ -76,7 +76,7 @@ class Pipeline(Worker):
         self._channels = channels
         self._ports = ports
         self._replay = replay
-        self._is_exact = replay is not None and bool(replay.marks)
+        self._is_exact = replay is not None and replay.playback.is_exact
         self._is_lossless = is_lossless
         self._sync_wait_ns = sync_wait_ns
         self.sync = self._new_sync()

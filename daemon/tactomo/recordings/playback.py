@@ -19,13 +19,19 @@ class Playback:
     """Where a replay is, for any thread; speed 0 is as fast as it is taken."""
 
     def __init__(
-        self, start_ns: int, end_ns: int, speed: float, last_ns: int | None = None
+        self,
+        start_ns: int,
+        end_ns: int,
+        speed: float,
+        last_ns: int | None = None,
+        is_exact: bool = False,
     ) -> None:
         self.passes = 0  # how often it was moved
         self.maps_before = 0  # how many maps were published before this pass
         self.start_ns = self.begin_ns = start_ns  # of the recording; of this pass
         self.loops = False  # whether the end is followed by the beginning
         self.waits_for_page = False  # whether it is paused until somebody looks
+        self.is_exact = is_exact  # whether it goes by what was recorded of each frame
         self.steered_ns = time.monotonic_ns()  # when somebody last steered it
         self._end_ns = end_ns
         self._last_ns = end_ns if last_ns is None else last_ns  # from where something still comes
@@ -64,6 +70,7 @@ class Playback:
                 "paused": self.is_paused,
                 "loop": self.loops,
                 "waits_for_page": self.waits_for_page,
+                "exact": self.is_exact,
                 "maps_before": self.maps_before,
             }
 

@@ -128,7 +128,9 @@ def read_replay(urls: Sequence[str], description: SensorDescription) -> Replay |
         marks=marks,
         reference=reference,
         is_paced=speed > 0,
-        playback=Playback(recording.start_ns, recording.end_ns, speed, _last_ns(marks)),
+        playback=Playback(
+            recording.start_ns, recording.end_ns, speed, _last_ns(marks), bool(marks)
+        ),
         calibration=calibration,
         knows_calibration=calibration is not None or had_none,
     )

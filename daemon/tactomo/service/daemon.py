@@ -67,7 +67,7 @@ from tactomo.config import DaemonConfig
 from tactomo.ending import at_end
 from tactomo.endpoint import allow_connections
 from tactomo.errors import CommandError, ConfigError
-from tactomo.events import EventBook
+from tactomo.events import OF_THE_SKIN, RECORDED, EventBook
 from tactomo.imaging.imaging import Imaging
 from tactomo.imaging.kept_reference import KeptReference
 from tactomo.imaging.pipeline import Pipeline
@@ -483,6 +483,8 @@ class Daemon:
     ) -> bool:
         if not self._events.is_due(name, about, reason):
             return False
+        if self._replay is not None and next_step and name in OF_THE_SKIN:
+            next_step = RECORDED
         severity, spared = EVENTS[name].severity, self._events.note(name, detail, next_step)
         if spared is not None:
             extra: dict[str, Any] = {"next_step": next_step} if next_step else {}

@@ -6,10 +6,12 @@ The status carries it, and whoever shows a status prints it: nobody else judges.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 from tactomo_client.schema import HealthIssue
 
+from tactomo.events import RECORDED
 from tactomo.plain import counted
 
 CORRUPT_NOTED = 1e-3  # share of packets: a line that loses one now and then still serves
@@ -112,14 +114,16 @@ TARING = ("warning", "a reference is being taken", "leave the skin alone until i
 
 def health_issues(status: Mapping[str, Any]) -> list[HealthIssue]:
     """Return what is wrong by the fields of a status message, errors first; empty if nothing is."""
-    found = [
+    of_skin = [
         *_of_state(status),
         *(each for port in status.get("ports") or [] for each in _of_port(port)),
-        *_of_method(status),
         *_of_flags(status),
         *_of_losses(status),
-        *_of_recorder(status.get("recorder") or {}),
     ]
+    if status.get("replay"):
+        here = (FASTER,)  # what this computer lacks, not the recorded one
+        of_skin = [i if i.next_step in here else replace(i, next_step=RECORDED) for i in of_skin]
+    found = [*of_skin, *_of_method(status), *_of_recorder(status.get("recorder") or {})]
     return sorted(found, key=lambda issue: issue.severity != "error")
 
 
@@ -189,7 +193,8 @@ def _of_losses(status: Mapping[str, Any]) -> Iterator[HealthIssue]:
     if incomplete > DROPPED_NOTED * came:
         # A busy computer loses scans, too: then nothing is known against the cable.
         severity = "warning" if is_busy or incomplete < FEWEST_INCOMPLETE else "error"
-        step = "check the cable of the channel that is missing; if it comes late, sync_wait_ms"
+        cable = "check the cable of the channel that is missing; if it comes late, sync_wait_ms"
+        step = FASTER if is_busy else cable
         yield HealthIssue(severity, f"{incomplete} {of} lacked a channel", step)
 
 

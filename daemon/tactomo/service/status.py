@@ -131,9 +131,11 @@ class Status:
         now_ns = time.monotonic_ns()
         if self._playback is not None:
             last_ns = max(last_ns, self._playback.steered_ns)
-        if now_ns - last_ns > stale_s * 1e9:
-            return "stale" if now_ns - self._pipeline.delivered_ns > stale_s * 1e9 else "late"
-        return "taring" if self._imaging.taring.is_on else "running"
+        if now_ns - max(last_ns, self._pipeline.delivered_ns) > stale_s * 1e9:
+            return "stale"
+        if self._imaging.taring.is_on:
+            return "taring"
+        return "late" if now_ns - last_ns > stale_s * 1e9 else "running"
 
     def summary(self, subscriptions: int) -> str:
         """Return how the daemon is in one line, for `systemctl status`."""

@@ -169,6 +169,16 @@ def test_what_is_lost_is_told_by_counts_of_the_last_minute(tactomo: Run, control
     assert "7058 dual scans dropped" in shown
 
 
+def test_a_replay_sends_nobody_to_a_cable_that_is_not_there(tactomo: Run, control: Any) -> None:
+    losses = {"frames": 600, "dropped_scans": 150, "incomplete_scans": 600}
+    control.answers["status"] = {**STATUS, "replay": {"exact": True}, "last_minute": losses}
+    judge(control)
+    shown = tactomo("status").stdout
+    assert "so it was recorded" in shown
+    assert "give the daemon more of the processor" in shown  # that is of this computer
+    assert "cable" not in shown
+
+
 def test_before_the_first_tare_it_says_that_one_is_being_taken(tactomo: Run, control: Any) -> None:
     told = {"ports": [], "flags": ["no_reference"], "dropped_scans": 0, "incomplete_scans": 0}
     control.answers["status"] = {**STATUS, **told, "state": "taring"}

@@ -125,6 +125,7 @@ def test_a_paused_replay_goes_on_frame_by_frame_and_then_to_its_end(play: Any, l
         b.until(lambda count=count: len(counters(b)) == count)
         b.until(lambda: b.ask("status")["replay"]["paused"])
     assert counters(b) == list(values)[:3]
+    assert b.ask("status")["replay"]["exact"]
     position_s = b.ask("status")["replay"]["position_s"]
     assert 0 < position_s < b.ask("status")["replay"]["duration_s"]
     assert b.ask("status")["replay"]["position_s"] == position_s  # it stands still
@@ -296,6 +297,22 @@ def test_a_move_into_the_middle_of_a_packet_is_no_damage(play: Any, torn: Path) 
     events = b.ask("status")["events"]["counts"]
     assert not {"corrupt_packets", "device_clock_jumped", "device_restarted"} & events.keys()
     assert b.ask("status")["ports"][0]["corrupt"] == 0
+
+
+def test_a_replay_sends_nobody_to_a_cable_that_is_not_there(
+    bench: Start, play: Any, tmp_path: Path
+) -> None:
+    live = bench()
+    live.tare()
+    live.ask("record_start", path="noisy.mcap")
+    live.step()
+    live.skin.lines[0].say(b"\x00noise on the line\x00")
+    live.step()
+    assert "cable" in live.listener.event("corrupt_packets")["next_step"]
+    live.ask("record_stop")
+    again = play(tmp_path / "noisy.mcap")
+    again.ask("replay", paused=False)
+    assert again.listener.event("corrupt_packets")["next_step"] == "so it was recorded"
 
 
 def test_a_replay_that_loops_begins_again(play: Any, life: Life) -> None:

@@ -69,11 +69,12 @@ export function verdict(state, now) {
     return banner("replay-moving", "info", "The replay jumps.", "The map follows at once.");
   }
   if (fields.replay?.paused) {
-    return banner("replay-paused", "info", "The replay is paused.", "The map shows the frame at the slider.");
+    return banner("replay-paused", "info", "The replay is paused.", "The map shows the frame at the slider"
+      + (fields.replay.maps_before ? ", solved without those before: pressures may differ from the recorded ones." : "."));
   }
   const age = Math.min(ageOf(frame, now), now - state.stoodAt);
   if (age > staleAfter(fields, hello)) {
-    const since = frame ? `The newest scan is ${seconds(age)} old. ` : "";
+    const since = frame ? `The newest frame is ${seconds(age)} old. ` : "";
     return banner("stale", "error", "Stale.", since + wrong);
   }
   const [issue] = errors;

@@ -8,6 +8,7 @@ const FINER = 5;           // intervals of the smooth image for each one of the 
 const OUTLINE_FINER = 3;
 const ELECTRODE_MM = [6, 2.4];  // drawn size: along the rim, across it
 const NARROW_PX = 520;     // below this the colour bar lies under the map
+const TICK_PX = 40;        // the least room of a number under the map
 
 /** The corners of a sheet's bounding box. */
 function box({ x: [x0, x1], y: [y0, y1] }) {
@@ -227,7 +228,8 @@ export class MapView {
     const numberWidth = Math.max(20, c.measureText(number).width + 10);
     const width = numberWidth + c.measureText(label).width + 14;
     const { left, top, width: w } = this.plot;
-    const bx = Math.min(Math.max(x + 10, left + 2), left + w - width - 2);
+    const end = this.plot.narrow ? this.size[0] : left + w;
+    const bx = Math.min(x + 10, end - width - 2);
     const by = y - 34 < top ? y + 12 : y - 34;
     c.beginPath();
     c.roundRect(bx, by, width, 22, 11);
@@ -320,7 +322,7 @@ export class MapView {
     c.lineWidth = 1;
     c.textAlign = "center";
     c.textBaseline = "top";
-    for (const x of ticks(sheet.x[0], sheet.x[1], 6)) {
+    for (const x of ticks(sheet.x[0], sheet.x[1], Math.min(6, width / TICK_PX))) {
       const [px] = this.mmToPixel(x, 0);
       line(c, px, top + height + 5, px, top + height + 10);
       c.fillText(number(x), px, top + height + 13);
@@ -367,7 +369,7 @@ export class MapView {
     c.font = `12px ${theme.font}`;
     c.textBaseline = narrow ? "top" : "middle";
     c.textAlign = narrow ? "center" : "left";
-    const marks = ticks(0, scale, 5);
+    const marks = ticks(0, scale, narrow ? Math.min(5, bar.w / (TICK_PX + 15)) : 5);
     marks.forEach((value, i) => {
       const isLast = i === marks.length - 1;
       if (narrow && isLast) c.textAlign = "right";

@@ -138,7 +138,7 @@ function showStages(stages) {
   });
 }
 
-function showChannels({ state, ports, rates, events, companions = {}, issues = [] }, isCurrent) {
+function showChannels({ state, ports, rates, events, companions = {}, companion_words: words, issues = [] }, isCurrent) {
   const lines = issues.map(({ severity, what, next_step: step }) =>
     [severity === "error" ? "bad" : "warn", what, step]);
   const stands = ["paused", "ended"].includes(state);
@@ -148,9 +148,8 @@ function showChannels({ state, ports, rates, events, companions = {}, issues = [
     lines.push([hz > 0 || stands ? "good" : "bad", name,
       stands ? state : hz > 0 ? `${fixed(hz, 1)} scans/s` : "no scans"]);
   }
-  for (const [name, { state: does, reading, force_n: force, force_sigma_n: sigma }] of Object.entries(companions)) {
-    const kind = { fitted: "good", disputed: "bad", missing: "bad" }[does] ?? "";
-    lines.push([kind, name, force === null ? does : `${reading}: ${fixed(force, 1)} ± ${fixed(sigma, 1)} N, ${does}`]);
+  for (const [name, { state: does }] of Object.entries(companions)) {
+    lines.push([{ fitted: "good", disputed: "bad", missing: "bad" }[does] ?? "", name, words[name]]);
   }
   for (const { url, state: does, device, bytes: received } of ports ?? []) {
     lines.push(["", url, [does, device?.device_id, bytes(received)].filter(Boolean).join(", ")]);

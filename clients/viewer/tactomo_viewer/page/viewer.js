@@ -26,7 +26,8 @@ const state = {
   painted: [],              // {at, latency} of the last frames, ms
   fitted: { kpa: 0, percent: 0 },
   awaited: null,            // the press whose picture is awaited
-  get stoodAt() { return replay.stoodAt; },
+  taredAt: -Infinity,       // when the daemon last said that it tares
+  get stoodAt() { return Math.max(replay.stoodAt, state.taredAt); },
   get isMoving() { return replay.isBefore(state.frame); },
 };
 
@@ -90,6 +91,7 @@ function onMessage(message) {
     },
     status: () => {
       state.status = { fields: message.status, age_ms: message.age_ms, receivedAt: performance.now() };
+      if (message.status.state === "taring") state.taredAt = performance.now();
       describe(message.status.description);
       showStatus(message.status, true);
       replay.show(state.status, state.hello, state.drawn !== null);
@@ -269,7 +271,8 @@ function refresh() {
   else showState("connecting");
   if (!linked && state.status) showStatus(state.status.fields, false);
   for (const id of ["tare", "record", "method"]) {
-    byId(id).disabled = !linked || Boolean(state.hello?.read_only);
+    byId(id).disabled = !linked || Boolean(state.hello?.read_only)
+      || (id === "tare" && Boolean(state.status.fields.replay?.exact));
   }
   const canPress = link.isOpen && state.twin.answers && state.status?.fields.source?.kind === "twin";
   if (canPress) byId("press-card").hidden = false;
@@ -435,14 +438,16 @@ for (const input of document.querySelectorAll("#view input, #view select, input[
 
 let pointer = null;  // where it is, in mm: what comes under it while it rests is read out, too
 
-byId("map").addEventListener("pointermove", ({ offsetX, offsetY }) => {
-  pointer = view.pixelToMm(offsetX, offsetY);
-  showReadout();
-});
-byId("map").addEventListener("pointerleave", () => {
-  pointer = null;
-  showReadout();
-});
+for (const id of ["map", "surface"]) {
+  byId(id).addEventListener("pointermove", ({ offsetX, offsetY }) => {
+    pointer = (id === "map" ? view : surface)?.pixelToMm(offsetX, offsetY);
+    showReadout();
+  });
+  byId(id).addEventListener("pointerleave", () => {
+    pointer = null;
+    showReadout();
+  });
+}
 for (const event of ["pointermove", "pointerleave"]) byId("strip").addEventListener(event, refresh);
 
 function showReadout() {
