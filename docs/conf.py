@@ -27,7 +27,7 @@ default_role = "code"  # `name` in docstrings
 html_theme = "furo"  # nothing of it comes from elsewhere, fonts neither
 html_title = f"tactomo {release}"
 templates_path = ["_templates"]
-html_copy_source = html_show_sourcelink = False
+html_copy_source = html_show_sourcelink = html_show_copyright = False
 
 
 def add_navigation(_: Sphinx, name: str, source: list[str]) -> None:
