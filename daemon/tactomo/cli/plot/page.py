@@ -162,8 +162,11 @@ def _draw_path(
     axes = figure.subplots()
     if description is not None:
         _draw_sheet(axes, description)
-    for name, track in course.tracks.items():
-        _draw_track(axes, track, colours[name], name)
+    for index, (name, track) in enumerate(course.tracks.items()):
+        last = track.contacts[-1].x_mm, track.contacts[-1].y_mm
+        aside = 7 + 10 * (index % 4), 5  # of tracks that end at one place each name is read
+        axes.annotate(name, last, aside, textcoords="offset points", color=colours[name])
+        _draw_track(axes, track, colours[name])
     axes.set(aspect="equal", xlabel="x (mm)", ylabel="y (mm)")
     axes.set_title("path, from ○ to ●; dots by area", fontsize=10)
 
@@ -179,7 +182,7 @@ def _draw_sheet(axes: Any, description: SensorDescription) -> None:
     axes.set(xlim=(-0.57 * width, 0.57 * width), ylim=(-0.57 * height, 0.57 * height))
 
 
-def _draw_track(axes: Any, track: Track, colour: Any, name: str) -> None:
+def _draw_track(axes: Any, track: Track, colour: Any) -> None:
     x = [contact.x_mm for contact in track.contacts]
     y = [contact.y_mm for contact in track.contacts]
     sizes = [max(4.0, contact.area_mm2 / 25) for contact in track.contacts]
@@ -187,7 +190,6 @@ def _draw_track(axes: Any, track: Track, colour: Any, name: str) -> None:
     axes.plot(x, y, color=colour, linewidth=1.2)
     axes.plot(x[0], y[0], "o", color=colour, markerfacecolor="white", markersize=7)
     axes.plot(x[-1], y[-1], "o", color=colour, markersize=7)
-    axes.annotate(name, (x[-1], y[-1]), (7, 5), textcoords="offset points", color=colour)
 
 
 def _draw_rows(
@@ -250,13 +252,15 @@ def _draw_out_of_range(axes: Any, course: Course, colours: dict[str, Any]) -> No
                 linewidth=3,
                 alpha=0.5,
                 transform=across,
-                label="touched, pressure unknown" if lights == 1 else None,
+                label="touched, pressure unknown",
             )
         beyond = [(t, c.pressure_kpa) for t, c in _pairs(track) if c.pressure_range == "above"]
         if beyond:
-            axes.plot(*zip(*beyond, strict=True), "^", color=colours[name], markersize=3)
-    if lights:
-        axes.legend(fontsize=7, loc="center left", handlelength=1.2)
+            mark = {"color": colours[name], "markersize": 3, "label": "at least"}
+            axes.plot(*zip(*beyond, strict=True), "^", **mark)
+    told = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    if told:
+        axes.legend(told.values(), told, fontsize=7, loc="center left", handlelength=1.2)
 
 
 def _draw_force(axes: Any, course: Course, colours: dict[str, Any]) -> None:
