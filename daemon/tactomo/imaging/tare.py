@@ -119,7 +119,6 @@ class Taring:
             self._put_off()
             if not self._waits and not taken.tare.done():
                 return
-            self._taken = None
             self._finish(taken)
         if (tare := self._tare) and tare.answers and time.monotonic() > self._deadline_s:
             self._tare = None
@@ -175,6 +174,8 @@ class Taring:
         except ModelError as error:
             self._refuse(tare, _refusal_of(error))
             return
+        finally:  # to put it in force takes a while: until then the tare is on
+            self._taken = None
         trim_memory()
         if not is_new:
             return

@@ -52,6 +52,28 @@ def test_frames_go_on_against_the_last_reference_until_the_new_one_is_understood
     assert b.ask("status")["dropped_scans"] == 0
 
 
+def test_it_is_taring_until_the_reference_is_in_force(
+    bench: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use, begun, may_end = Memory.use, threading.Event(), threading.Event()
+
+    def slowly(self: Memory, tare: Any) -> None:
+        begun.set()
+        may_end.wait(60)
+        use(self, tare)
+
+    monkeypatch.setattr(Memory, "use", slowly)
+    b = bench()
+    b.skin.introduce()
+    try:
+        b.until(lambda: begun.is_set() or b.skin.scan() is None)
+        b.skin.scan()
+        assert b.ask("status")["state"] == "taring"
+    finally:
+        may_end.set()
+    b.listener.event("tared")
+
+
 def test_a_daemon_stops_while_it_finds_out_how_sheets_are(
     bench: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
