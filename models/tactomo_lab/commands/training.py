@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
@@ -50,30 +49,29 @@ def simulate(
 ) -> None:
     """Simulate scenes to train networks on: voltages of both channels, and the truth.
 
-    The same command continues after Ctrl-C; a larger --scenes extends a finished set. Scenes depend
-    only on the seed and their number, and none is a scene of `tactomo evaluate`. A
-    scene takes a tenth of a second on one core, a thousand scenes take 2 MB.
+    FOLDER gets one file, when the last scene is done. Scenes depend only on the seed and their
+    number, and none is a scene of `tactomo evaluate`. A scene takes a tenth of a second on one
+    core, a thousand scenes take 2 MB.
 
     Scenes have none to ten contacts of several shapes, flat or soft, also lighter and heavier than
     the range; both signs; contrast 10 to 100; sheets up to as uneven as hand-made sheets; uneven,
     displaced and sometimes weak electrodes. Training adds the noise.
-
-    Needs `pip install 'tactomo-lab[train]'`.
     """
     from tactomo_models import load_description
 
     from tactomo_lab.training.training_scenes import simulate as simulate_scenes
 
     description = load_description(sensor)
-    steps = simulate_scenes(description, folder, scenes, seed=seed, jobs=jobs or -1)
-    with needs("training", EXTRA):
-        before, now = _follow(steps, scenes, "scenes", folder)
+    steps = simulate_scenes(description, folder, scenes, seed=seed, jobs=jobs)
+    with _progress() as bar:
+        task = bar.add_task("scenes", total=scenes)
+        for more in steps:
+            bar.advance(task, more)
     if as_json:
-        counts = {"scenes": before + now, "new": now}
         told = {"folder": str(folder), "seed": seed, "sensor": description.name}
-        print_json({**told, **counts})
+        print_json({**told, "scenes": scenes})
     else:
-        say(f"{folder}: {scenes} scenes, {now} of them new")
+        say(f"{folder}: {scenes} scenes")
 
 
 @app.command(
@@ -204,14 +202,10 @@ def _train(
                 line = _in_words(epoch, len(training.history))
                 shown.console.print(line, highlight=False, soft_wrap=True)
         except KeyboardInterrupt:
-            what = f"{checkpoint} has {len(training.history)} of {settings.epochs} epochs"
-            raise _stopped(what) from None
+            done = f"{checkpoint} has {len(training.history)} of {settings.epochs} epochs"
+            say(f"stopped: {done}; run the same command again, it goes on there", err=True)
+            raise typer.Exit(INTERRUPTED) from None
     return training
-
-
-def _stopped(what: str) -> typer.Exit:
-    say(f"stopped: {what}; run the same command again, it goes on there", err=True)
-    return typer.Exit(INTERRUPTED)
 
 
 def _in_words(epoch: Epoch, number: int) -> str:
@@ -226,24 +220,6 @@ def _in_words(epoch: Epoch, number: int) -> str:
         for noise, row in rows.items()
     ]
     return f"epoch {number}: loss {epoch.loss:.4f}; held-out ICC ({names}): {', '.join(parts)}"
-
-
-def _follow(steps: Iterator[int], total: int, what: str, folder: Path) -> tuple[int, int]:
-    """Show the progress of a simulation.
-
-    Returns:
-        How many scenes were there before, and how many are new.
-    """
-    before = done = next(steps)
-    with _progress() as shown:
-        task = shown.add_task(what, total=total, completed=before)
-        try:
-            for more in steps:
-                done += more
-                shown.advance(task, more)
-        except KeyboardInterrupt:
-            raise _stopped(f"{folder} has {done} of {total} scenes") from None
-    return before, done - before
 
 
 def _progress() -> Progress:

@@ -1,5 +1,5 @@
 """Training the fusion networks: scenes are simulated, networks trained and exported to ONNX.
 
-PyTorch and joblib are imported in here alone: `pip install 'tactomo-lab[train]'`. What runs a
-trained network, `tactomo_models.methods.trained_networks`, needs neither.
+PyTorch is imported in here alone: `pip install 'tactomo-lab[train]'`. What runs a
+trained network, `tactomo_models.methods.trained_networks`, does not need it.
 """

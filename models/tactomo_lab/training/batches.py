@@ -56,7 +56,7 @@ class SceneBatches:
         channels: tuple[Channel, ...],
         forward: ForwardModel,
     ) -> None:
-        scenes = read_scenes(folder)
+        scenes = read_scenes(folder, description)
         assert description.magnitude is not None
         own = np.float32(description.magnitude.response.sign)
         same = np.ones(len(scenes["contacts"]), np.float32)

@@ -27,7 +27,6 @@ from tactomo_lab.training.batches import SceneBatches
 from tactomo_lab.training.networks import FusionNetwork
 from tactomo_lab.training.objectives import FusionObjective, linear_images
 from tactomo_lab.training.train import Settings, Training, load_weights
-from tactomo_lab.training.training_scenes import PRESET, read_manifest
 
 OPSET: Final = 18
 MIN_HALVED: Final = 1024  # numbers of a weight that is stored in half precision
@@ -75,16 +74,6 @@ def prepare(
 
     Raises ModelError where the scenes are of another sensor, or something is missing.
     """
-    manifest = read_manifest(folder)
-    for name, held, needed in (
-        ("preset", manifest.preset, PRESET),  # versions before had a second one
-        ("sensor", manifest.sha256, description.sha256),
-    ):
-        if held != needed:
-            raise ModelError(
-                f"{folder} holds scenes of {name} {held[:12]}, the network needs "
-                f"{needed[:12]}: name another folder, or simulate one"
-            )
     torch.manual_seed(seed)
     scale = full_range(description)
     there = tuple(name for name in configuration.channels if name in description.channels)

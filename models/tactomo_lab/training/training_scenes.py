@@ -1,9 +1,6 @@
 """Simulating training scenes: thousands of them, on as many cores as there are.
 
-Scenes are kept in shards, files of a few hundred that are drawn from their own seeds, so that an
-interrupted run goes on where it stopped and shards may be made anywhere, in any order. One process
-writes them, each as a whole. Voltages are noise-free: noise is added in training, anew in every
-epoch.
+Voltages are noise-free: noise is added in training, anew in every epoch.
 
 The mesh is another one than the one that inverts, and coarser than the one that evaluates; within
 each triangle the conductivity is the mean over nine parts (of resistivities, where contacts
@@ -13,19 +10,16 @@ magnitude channel (root mean square; twice that where contacts are small).
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Iterator, Mapping
-from concurrent.futures import BrokenExecutor
-from contextlib import AbstractContextManager, closing
-from dataclasses import asdict, dataclass
+import multiprocessing
+from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from tactomo_models.archive import read_arrays, write_arrays, write_whole
+from tactomo_models.archive import read_arrays, write_arrays
 from tactomo_models.arrays import FloatArray
 from tactomo_models.errors import DataError, ModelError, os_errors_as
 from tactomo_models.physics.bare_sheet import scan_voltages, transfer_resistances, volts_per_unit
@@ -50,34 +44,12 @@ from tactomo_lab.scenes.simulation import (
     with_opposite_magnitude,
 )
 
-SHARD = 200  # scenes in a file
+TOGETHER = 200  # scenes that a process simulates at a time
+SCENES = "scenes.npz"  # of a folder
 SPACING_SHARE = 5 / 6  # of the map's nodes' distance: 2.5 mm on the paper's sensor
 REFINEMENTS = 2
 PARTS = 3  # that each side of a triangle is divided into, where its conductivity is averaged
-PRESET = "robust"  # what scenes are drawn by; versions before had a second one
-FORMAT = 2  # raise it when what is drawn or simulated changes
-MANIFEST = "manifest.json"
-
-
-@dataclass(frozen=True)
-class Manifest:
-    """What a folder of shards holds; a run with other settings is refused.
-
-    Attributes:
-        format: of the shards.
-        preset, seed: what scenes were drawn by.
-        sensor, sha256: description, and the hash of its physics.
-        scenes: how many there are to be.
-        responses: hash of what its channels show of a pressure; "" where that was not kept.
-    """
-
-    format: int
-    preset: str
-    seed: int
-    sensor: str
-    sha256: str
-    scenes: int
-    responses: str = ""
+FORMAT = 3  # raise it when what is drawn or simulated changes
 
 
 @dataclass(frozen=True)
@@ -191,22 +163,17 @@ def _parts() -> FloatArray:
     return np.stack([1 - second - third, second, third], axis=1)
 
 
-def simulate_shard(
-    description: SensorDescription, seed: int, first: int, size: int
+def simulate_some(
+    description: SensorDescription, seed: int, scenes: int, first: int
 ) -> dict[str, Any]:
-    """Simulate the `size` scenes of a shard that begins with scene `first`, on one thread."""
+    """Simulate up to `TOGETHER` of so many scenes, from the number `first` on, on one thread."""
     simulator = SceneSimulator(description)
     with threadpool_limits(1):
         made = [
             simulator.simulate(draw_scene(description, seed, number))
-            for number in range(first, first + size)
+            for number in range(first, min(first + TOGETHER, scenes))
         ]
     return {key: np.stack([one[key] for one in made]) for key in made[0]}
-
-
-def shard_path(folder: Path, first: int) -> Path:
-    """File of the shard that begins with a scene's number."""
-    return folder / f"scenes-{first:07d}.npz"
 
 
 def simulate(
@@ -215,145 +182,71 @@ def simulate(
     scenes: int,
     *,
     seed: int = 0,
-    jobs: int = -1,
+    jobs: int | None = None,
 ) -> Iterator[int]:
-    """Simulate what is missing of a set of scenes.
+    """Simulate a set of scenes, and write it when the last one is done.
 
-    Yields:
-        How many scenes more are there: those of earlier runs first.
+    Returns:
+        How many scenes more are simulated, again and again; simulated as it is asked for.
 
     Raises:
-        ModelError: the folder holds another set, a file cannot be written, or a process fails.
+        ModelError: the folder holds a set, the file cannot be written, or a process fails.
         DataError: the sensor has no magnitude channel, or no room for the contacts.
-        ModuleNotFoundError: joblib is not installed; it comes with tactomo-lab[train].
     """
-    from joblib import Parallel, delayed  # before anything is written
-
     SceneSimulator(description)  # refuses a sensor it cannot serve before anything is written
-    write_manifest(folder, _manifest(description, seed, scenes))
-    make = partial(simulate_shard, description, seed)
-    sizes = dict(shards_of(scenes))
-    missing = [n for n in sizes if not is_whole(shard_path(folder, n), sizes[n])]
-    yield sum(sizes.values()) - sum(sizes[first] for first in missing)
+    path = folder / SCENES
+    if path.exists():
+        raise ModelError(f"{path} is there already: choose another folder, or delete it")
+    with os_errors_as(ModelError, f"cannot write {path}", "choose another folder"):
+        folder.mkdir(parents=True, exist_ok=True)
+    return _simulated(description, path, scenes, seed, jobs)
 
-    def numbered(first: int, size: int) -> tuple[int, dict[str, Any]]:
-        return first, make(first, size)
 
-    work = (delayed(numbered)(first, sizes[first]) for first in missing)
+def _simulated(
+    description: SensorDescription, path: Path, scenes: int, seed: int, jobs: int | None
+) -> Iterator[int]:
+    parts: list[dict[str, Any]] = []
+    # Not forked: what runs threads does not survive that.
+    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"))
     try:
-        with closing(Parallel(n_jobs=jobs, return_as="generator_unordered")(work)) as made:
-            for first, arrays in made:
-                with _writing(path := shard_path(folder, first)):
-                    write_arrays(path, arrays)
-                yield sizes[first]
+        make = partial(simulate_some, description, seed, scenes)
+        for made in (map if jobs == 1 else pool.map)(make, range(0, scenes, TOGETHER)):
+            parts.append(made)
+            yield len(made["map"])
     except BrokenExecutor as error:
         raise ModelError(
-            "a process that simulates was killed, as happens when memory runs out; run the same "
-            "command again with fewer jobs: it goes on where it stopped"
+            "a process that simulates was killed, as happens when memory runs out; run the command "
+            "again with fewer jobs"
         ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+    arrays = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    made_of = {"format": np.array(FORMAT), "sha256": np.array(description.sha256)}
+    with os_errors_as(ModelError, f"cannot write {path}", "free some space"):
+        write_arrays(path, arrays | made_of)
 
 
-def shards_of(scenes: int) -> Iterator[tuple[int, int]]:
-    """Number of the first scene of each shard, and how many scenes it has at least."""
-    for first in range(0, scenes, SHARD):
-        yield first, min(SHARD, scenes - first)
-
-
-def _writing(path: Path) -> AbstractContextManager[None]:
-    """Say what to do where a file of a set cannot be written."""
-    again = "then run the same command again: it goes on where it stopped"
-    next_step = f"free some space or choose another folder, {again}"
-    return os_errors_as(ModelError, f"cannot write {path}", next_step)
-
-
-def _manifest(description: SensorDescription, seed: int, scenes: int) -> Manifest:
-    channels = description.model_dump_json(include={"magnitude", "structure"})
-    responses = hashlib.sha256(channels.encode()).hexdigest()
-    return Manifest(FORMAT, PRESET, seed, description.name, description.sha256, scenes, responses)
-
-
-def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Say in a folder what its shards are; the number of scenes may change.
-
-    Raises ModelError where it holds something else, or cannot be written.
-    """
-    path = folder / MANIFEST
-    if path.exists():
-        for name, old, new in _differences(read_manifest(folder), manifest):
-            raise ModelError(
-                f"{folder} holds scenes made with another {name}, {old}, not {new}: choose another "
-                "folder, or delete this one"
-            )
-    content = json.dumps(asdict(manifest), indent=2) + "\n"
-    with _writing(path):
-        write_whole(path, lambda file: file.write(content.encode()))
-
-
-def _differences(old: Manifest, new: Manifest) -> Iterator[tuple[str, str, str]]:
-    for name in ("format", "preset", "seed", "sensor", "sha256", "responses"):
-        before, now = str(getattr(old, name)), str(getattr(new, name))
-        if before != now and before:
-            yield name, before[:16], now[:16]
-
-
-def read_manifest(folder: Path) -> Manifest:
-    """Read what a folder of shards holds.
-
-    Raises ModelError where there is none, or it is damaged.
-    """
-    path = folder / MANIFEST
-    try:
-        return Manifest(**json.loads(path.read_text()))
-    except FileNotFoundError as error:
-        raise ModelError(
-            f"{folder} holds no simulated scenes; make some: tactomo models simulate {folder}"
-        ) from error
-    except (OSError, ValueError, TypeError) as error:
-        raise ModelError(
-            f"{path} is damaged ({error}): delete the folder and simulate anew"
-        ) from error
-
-
-def read_scenes(folder: Path) -> dict[str, Any]:
+def read_scenes(folder: Path, description: SensorDescription) -> dict[str, Any]:
     """Read all scenes of a folder, in the order of their numbers.
 
     Returns:
         The arrays of `SceneSimulator.simulate`, each with a first axis of scenes.
 
-    Raises ModelError where the folder holds none, is not complete, or a file is damaged.
+    Raises ModelError where the folder holds none, those of another sensor, or the file is damaged.
     """
-    shards = [
-        read_shard(shard_path(folder, first), size)
-        for first, size in shards_of(read_manifest(folder).scenes)
-    ]
-    return {key: np.concatenate([shard[key] for shard in shards]) for key in shards[0]}
-
-
-def read_shard(path: Path, size: int) -> dict[str, Any]:
-    """Read the first scenes of a shard, which has more if the set was larger once."""
+    path = folder / SCENES
     try:
         arrays = read_arrays(path)
-    except FileNotFoundError:
-        arrays = {}
-    except (OSError, DataError) as error:
+        made_of = (int(arrays.pop("format")), str(arrays.pop("sha256")))
+    except FileNotFoundError as error:
         raise ModelError(
-            f"{error}; run `tactomo models simulate` again, it makes damaged files anew"
+            f"{folder} holds no simulated scenes; make some: tactomo models simulate {folder}"
         ) from error
-    if _length(arrays) < size:
+    except (OSError, DataError, KeyError, ValueError, TypeError) as error:
+        raise ModelError(f"{path} is damaged ({error}): delete it and simulate anew") from error
+    if made_of != (FORMAT, description.sha256):
         raise ModelError(
-            f"{path.parent} is not complete, {path.name} is missing or short: run `tactomo models "
-            "simulate` again, it goes on where it stopped"
+            f"{path} holds scenes of format {made_of[0]}, sensor {made_of[1][:12]}; the network "
+            f"needs {FORMAT}, {description.sha256[:12]}: name another folder, or simulate one"
         )
-    return {key: array[:size] for key, array in arrays.items()}
-
-
-def is_whole(path: Path, size: int) -> bool:
-    """Tell whether a shard is there, undamaged, with at least so many scenes."""
-    try:
-        return _length(read_arrays(path)) >= size
-    except (OSError, DataError):
-        return False
-
-
-def _length(arrays: Mapping[str, NDArray[Any]]) -> int:
-    return min((len(array) for array in arrays.values()), default=0)
+    return arrays
