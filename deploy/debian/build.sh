@@ -52,9 +52,6 @@ install -m 644 LICENSE "$root/usr/share/doc/tactomo/copyright"
 install -m 644 deploy/daemon.example.toml deploy/examples/* deploy/systemd/network.conf \
   "$root/usr/share/doc/tactomo/examples"
 
-"$venv/bin/python" deploy/debian/man_pages.py "$root/usr/share/man/man1"
-gzip -9n "$root"/usr/share/man/man1/*.1
-
 echo "package"
 mkdir "$root/DEBIAN"
 install -m 755 deploy/debian/postinst deploy/debian/prerm deploy/debian/postrm "$root/DEBIAN"

@@ -685,9 +685,8 @@ class Plan:
     """What frames are given for the method and the budget that were asked for."""
 
     tier: str = ""  #: the method in use
-    #: work, in milliseconds of a 2.5 GHz core; nil: the method's own
-    modelled_ms: float | None = None
-    #: fraction of the requested work; below 1 while other programs use the processor
+    #: fraction of the requested work (``budget_ms``, or the method's own); below 1 while other
+    #: programs use the processor
     share: float = 1.0
 
 

@@ -94,7 +94,6 @@ class DeviceClock:
 
     def __init__(self) -> None:
         self.jumps = 0  # how often the clock jumped, or went back
-        self.restarts = 0  # how often it went back, as it does where the device was reset
         # by how much scans came later than need be, while the clock is used
         self.delays = Durations()
         self._fit = _Fit()
@@ -140,7 +139,6 @@ class DeviceClock:
             return False
         self._backward += 1
         if self._backward > 1:
-            self.restarts += 1
             self._newest_us.clear()
             self._backward = 0
             self._jump()

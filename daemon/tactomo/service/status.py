@@ -104,7 +104,7 @@ class Status:
             "methods": list(self._methods),
             "tier_requested": imaging.method.requested.method,
             "budget_ms": imaging.method.requested.budget_ms,
-            "plan": self._plan(),
+            "plan": {"tier": imaging.method.effective.method, "share": imaging.method.share},
             "recording": active
             and {
                 "path": str(active.path),
@@ -159,15 +159,6 @@ class Status:
             "failures": recorder.failures,
             "failure": recorder.failure or None,
             "waits_for": recorder.waits_for or None,
-        }
-
-    def _plan(self) -> dict[str, Any]:
-        method = self._imaging.method
-        tier, modelled_ms = method.effective
-        return {
-            "tier": tier,
-            "modelled_ms": modelled_ms,
-            "share": method.share,
         }
 
     def _process(self) -> dict[str, Any]:

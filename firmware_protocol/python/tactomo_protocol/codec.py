@@ -69,7 +69,6 @@ class FieldError(ValueError):
         super().__init__(f"{field} is {value!r}; it must be {allowed}")
         self.field = field
         self.value = value
-        self.allowed = allowed
 
 
 def encode(packet: Packet) -> bytes:

@@ -43,7 +43,7 @@ STATUS = {
     "tier": "levelset",
     "tier_requested": "auto",
     "budget_ms": 12.0,
-    "plan": {"tier": "fit", "modelled_ms": 6.0, "share": 0.5},
+    "plan": {"tier": "fit", "share": 0.5},
     "flags": ["structure_missing"],
     "misfit": 1.02,
     "dropped_scans": 2,

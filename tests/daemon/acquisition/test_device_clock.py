@@ -153,20 +153,19 @@ def test_one_scan_that_seems_early_or_old_moves_nothing(jump_us: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("jump", "restarts"),
+    "jump",
     [
-        (lambda us: us % 200_000_000, 1),  # a reset
-        (lambda us: (us + 2**32 - 200_000_000) % 2**32, 1),  # 32 bits, never extended
-        (lambda us: us + (us >= 200_000_000) * 3_600_000_000, 0),  # the computer slept for an hour
-        (lambda us: us + (us >= 200_000_000) * 80_000, 0),
-        (lambda us: us - (us >= 200_000_000) * 3_000_000, 1),
+        lambda us: us % 200_000_000,  # a reset
+        lambda us: (us + 2**32 - 200_000_000) % 2**32,  # 32 bits, never extended
+        lambda us: us + (us >= 200_000_000) * 3_600_000_000,  # the computer slept for an hour
+        lambda us: us + (us >= 200_000_000) * 80_000,
+        lambda us: us - (us >= 200_000_000) * 3_000_000,
     ],
     ids=["reset", "wrap", "suspended", "ahead by 80 ms", "back by 3 s"],
 )
-def test_a_clock_that_jumps_is_known_again_soon(jump: Callable[[int], int], restarts: int) -> None:
+def test_a_clock_that_jumps_is_known_again_soon(jump: Callable[[int], int]) -> None:
     seen = arrivals(390, device_us=jump)
     assert seen.clock.jumps == 1
-    assert seen.clock.restarts == restarts
     after = [at_s for at_s in seen.undated_s if at_s > 100]
     assert 200 <= after[0] < after[-1] < 217
     assert seen.within_ms(1.0) < 1.0

@@ -182,8 +182,7 @@ def test_what_a_frame_was_allowed_is_allowed_again(
     b.tare()
     for budget_ms in (12, 3, None):
         b.ask("set_budget", budget_ms=budget_ms)
-        given = {"tier": "auto", "modelled_ms": budget_ms, "share": 1}
-        b.until(lambda given=given: {**b.ask("status")["plan"], "share": 1} == given)
+        b.until(lambda: b.ask("status")["plan"]["tier"] == "auto")
         status = b.ask("status")
         assert (status["tier_requested"], status["budget_ms"]) == ("auto", budget_ms)
         b.step(load=0.1)
