@@ -111,12 +111,15 @@ def reconstruct_file(
     scans, reference, readings = read or read_scans(source, description)
     if taught is not None and (why := taught.changed(reference)):
         raise CalibrationError(f"what was taught does not fit this skin: {why}; teach it anew")
-    nodes = (description.map.nodes_y, description.map.nodes_x)
+    shapes = {
+        **VECTORS,
+        **dict.fromkeys(IMAGES, (description.map.nodes_y, description.map.nodes_x)),
+    }
     failed, failure = 0, ""
     total = max(len(channel) for channel in scans.values())
     try:
         with (
-            GrowingArrays(TYPES, _folder_of(target)) as arrays,
+            GrowingArrays(TYPES, shapes, _folder_of(target)) as arrays,
             threadpool_limits(1),  # as the daemon runs: `seconds` are what a robot would see
         ):
             reconstructor = Reconstructor(
@@ -139,8 +142,7 @@ def reconstruct_file(
                 failure = failure or frame.failure
                 if progress:
                     progress(index + 1, total)
-            shapes = {**VECTORS, **dict.fromkeys(IMAGES, nodes)}
-            write_whole(target, lambda file: arrays.write(file, shapes))
+            write_whole(target, arrays.write)
     except OSError as error:
         raise DataError(
             f"cannot write {target}: {error.strerror}; name a file in a folder that you may write"

@@ -1,6 +1,6 @@
 """Arrays that grow by the row: in files until they are all there, and from there into an .npz.
 
-A file of frames may be larger than the memory, and how many there are may show at its end only.
+A file of frames may be larger than the memory, and how many contacts there are shows at its end.
 """
 
 from __future__ import annotations
@@ -25,15 +25,20 @@ class GrowingArrays:
 
     Args:
         types: the dtype of each.
+        shapes: of the rows of those whose rows are no single values.
         scratch: a folder with room for all of it, uncompressed.
     """
 
-    def __init__(self, types: Mapping[str, Any], scratch: Path) -> None:
-        self._undo = contextlib.ExitStack()
+    def __init__(
+        self, types: Mapping[str, Any], shapes: Mapping[str, tuple[int, ...]], scratch: Path
+    ) -> None:
+        self._types = {
+            name: np.dtype((dtype, shapes.get(name, ()))) for name, dtype in types.items()
+        }
+        self._rows = dict.fromkeys(types, 0)
         with contextlib.ExitStack() as undo:
-            self._arrays = {
-                name: _Growing(undo.enter_context(tempfile.TemporaryFile(dir=scratch)), dtype)
-                for name, dtype in types.items()
+            self._files: dict[str, IO[bytes]] = {
+                name: undo.enter_context(tempfile.TemporaryFile(dir=scratch)) for name in types
             }
             self._undo = undo.pop_all()
 
@@ -51,67 +56,24 @@ class GrowingArrays:
         self._undo.close()
 
     def append(self, rows: Mapping[str, Any]) -> None:
-        """Add a row to each array that is named: a number, or an array of one shape in all rows.
-
-        None is a row of NaN.
-        """
+        """Add a row to each array that is named; None is a row of NaN."""
         for name, row in rows.items():
-            self._arrays[name].append(row)
+            dtype = self._types[name]
+            values = np.full(dtype.shape, np.nan if row is None else row, dtype.base)
+            self._files[name].write(values.tobytes())
+            self._rows[name] += 1
 
-    def write(
-        self,
-        output: IO[bytes],  # the .npz file
-        shapes: Mapping[str, tuple[int, ...]],  # of rows, where all of an array's may be NaN
-        **others: Any,  # further arrays
-    ) -> None:
-        """Write the archive."""
+    def write(self, output: IO[bytes]) -> None:
+        """Write the .npz file. A memory map would count all of it as this program's memory."""
         with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED, compresslevel=FAST) as archive:
-            for name, growing in self._arrays.items():
+            for name, file in self._files.items():
+                dtype = self._types[name]
+                header = {
+                    "descr": npy.dtype_to_descr(dtype.base),
+                    "fortran_order": False,
+                    "shape": (self._rows[name], *dtype.shape),
+                }
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                    growing.write(entry, shapes.get(name))
-            for name, array in others.items():
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                    npy.write_array(entry, array)
-
-
-class _Growing:
-    """One array in a file. Rows of NaN before the first other one wait until their shape is known.
-
-    It passes by when it is written: a memory map would count all of it as this program's memory.
-    """
-
-    def __init__(self, file: IO[bytes], dtype: Any) -> None:
-        self._file = file
-        self._dtype = np.dtype(dtype)
-        self._shape: tuple[int, ...] | None = None  # of a row
-        self._rows = 0
-        self._written = 0
-
-    def append(self, row: Any) -> None:
-        if row is not None:
-            values = np.asarray(row, self._dtype)
-            self._fill(values.shape)
-            self._file.write(values.tobytes())
-            self._written += 1
-        self._rows += 1
-
-    def write(self, entry: IO[bytes], shape: tuple[int, ...] | None) -> None:
-        shape = shape if self._shape is None else self._shape
-        if shape is not None:
-            self._fill(shape)
-        header = {
-            "descr": npy.dtype_to_descr(self._dtype),
-            "fortran_order": False,
-            "shape": (self._written, *(shape or ())),
-        }
-        npy.write_array_header_1_0(entry, header)
-        self._file.seek(0)
-        shutil.copyfileobj(self._file, entry)
-
-    def _fill(self, shape: tuple[int, ...]) -> None:
-        self._shape = shape
-        if self._written < self._rows:
-            absent = np.full(shape, np.nan, self._dtype).tobytes()
-            for _ in range(self._written, self._rows):
-                self._file.write(absent)
-            self._written = self._rows
+                    npy.write_array_header_1_0(entry, header)
+                    file.seek(0)
+                    shutil.copyfileobj(file, entry)

@@ -1,4 +1,4 @@
-"""`tactomo export`: a recording's frames for other programs: Foxglove, ROS 2, tables, NumPy."""
+"""`tactomo export`: a recording's frames for other programs: Foxglove, ROS 2, tables."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tactomo.errors import TactomoError, needs, os_errors_as
 if TYPE_CHECKING:
     from tactomo_client import Frame
 
-KINDS = {".mcap": "frames for Foxglove", ".csv": "contacts", ".npz": "maps and contacts"}
+KINDS = {".mcap": "frames for Foxglove", ".csv": "contacts"}
 BAG, DATASET = "a ROS 2 bag", "a LeRobot dataset"
 Moments: TypeAlias = Iterator[Moment]
 Writer: TypeAlias = Callable[[RecordedFrames, Moments, Any], int]
@@ -42,7 +42,6 @@ app = typer_app()
         "tactomo export grasp.mcap grasp_bag --ros2",
         "tactomo export grasp.mcap dataset --lerobot --robot steps.csv --task lift",
         "tactomo export grasp.mcap contacts.csv --from 2 --to 10",
-        "tactomo export grasp.mcap maps.npz",
     )
 )
 def export(
@@ -56,7 +55,7 @@ def export(
         Path,
         typer.Argument(
             metavar="OUT",
-            help="The file to write: .mcap, .csv, .npz; a new folder with --ros2, --lerobot.",
+            help="The file to write: .mcap, .csv; a new folder with --ros2, --lerobot.",
         ),
     ],
     ros2: Annotated[
@@ -100,8 +99,7 @@ def export(
     *.csv* has a row for each contact in each frame; a frame without contacts has a row with an
     empty `id`. Names hold the units; unknown values are empty. Numbers are exact.
 
-    *.npz* has `time_s`, `acquired_realtime_ns`, `scan_counter`, `age_s` (T,), `x_mm` (nx,), `y_mm`
-    (ny,), `pressure_kpa` (T, ny, nx), and all arrays of `tactomo reconstruct` except `seconds`.
+    Maps as arrays: `tactomo_client.recording` reads a recording in Python.
 
     The frames are the recorded frames (`tactomo record --maps`). Where there are none, or with
     `--description`, the command first reconstructs the recording, by the same code as live. Times
@@ -118,10 +116,7 @@ def export(
         prepare_file(file, force=force, source=recording)
     gaps = Gaps()
     told: list[str] = []
-    if kind == DATASET:
-        write = _dataset_writer(robot, fps, task, gaps, told)
-    else:
-        write = _writer(kind, output.parent)
+    write = _dataset_writer(robot, fps, task, gaps, told) if kind == DATASET else _writer(kind)
     with recorded_frames(recording, description, start_s, end_s, output.parent) as frames:
         moments = frames.moments("contacts" if kind == ".csv" else "map")
         watched = gaps.watch(frames.with_progress(moments, "exporting"))
@@ -146,7 +141,7 @@ def _kind(output: Path) -> str:
     return kind
 
 
-def _writer(kind: str, scratch: Path) -> Writer:
+def _writer(kind: str) -> Writer:
     from tactomo_client.filled import filled
     from tactomo_client.schema import Mount
 
@@ -156,10 +151,6 @@ def _writer(kind: str, scratch: Path) -> Writer:
         from tactomo.cli.files.csv import write_contacts
 
         return lambda _, moments, file: write_contacts(moments, file)
-    if kind == ".npz":
-        from tactomo.cli.files.npz import write_maps
-
-        return lambda _, moments, file: write_maps(moments, file, scratch)
     if kind == ".mcap":
         with needs("Foxglove", "pip install 'tactomo[foxglove]'"):
             from tactomo_foxglove import write_mcap
