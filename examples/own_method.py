@@ -1,8 +1,8 @@
 """A method of one's own: Tikhonov that expects change where the structure channel answers.
 
-Run, in this folder, to reconstruct a file, or to compare the method with others:
+Run, in this folder, to reconstruct a file, or to draw the method on the chart beside others:
     tactomo reconstruct scans.npz maps.npz --method own_method:StructurePrior
-    tactomo evaluate field --rows ordinary --method own_method:StructurePrior,tikhonov --count 8
+    tactomo bench --chart chart.png --method own_method:StructurePrior --method tikhonov --count 2
 """
 
 import numpy as np

@@ -21,7 +21,7 @@ RUN_AT_ONCE = ("Arrays in", "What a frame says", "Methods")
 METHOD, PROTOCOL = "A method of your own", "A device protocol of your own"
 SMALLER = {
     "--count 2 --contacts 1-4": "--count 1 --contacts 1",
-    "tikhonov --count 8": "tikhonov --count 1",
+    "--method tikhonov --count 2": "--count 1",
 }
 
 
@@ -68,13 +68,19 @@ def test_arrays_become_maps_and_an_own_method_does_the_same(
     run(tried, names)
     assert names["frame"].tier == "StructurePrior"
     assert len(names["frame"].contacts) == 1
-    reconstruct, *evaluations = PAGE.commands(METHOD)[:3]
+    reconstruct, evaluate = PAGE.commands(METHOD)[:2]
     newcomer.run(reconstruct)
     with np.load("maps.npz") as maps:
         assert correlation(maps["map"][0], names["frame"].map) > 0.95
         assert not maps["flags"].any()
-    for evaluate in evaluations:
-        assert "own_method:StructurePrior" in newcomer.run(evaluate)
+    assert "own_method:StructurePrior" in newcomer.run(evaluate)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_an_own_method_is_charted(newcomer: Newcomer) -> None:
+    newcomer.run(PAGE.commands(METHOD)[2])
+    assert Path("chart.png").exists()
 
 
 @pytest.mark.slow

@@ -23,8 +23,8 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
+from tactomo.cli.laboratory import not_installed
 from tactomo.cli.output import say
-from tactomo.errors import TactomoError
 
 ENTRY_POINTS = "tactomo.commands"
 OTHERS = "Of other distributions"
@@ -127,10 +127,7 @@ class _Commands(Mapping[str, Any]):
         if path in _entry_points():
             return _entry_points()[path].load()
         if line is not None or path in OF_LABORATORY:
-            raise TactomoError(
-                f"{path.replace('.', ' ')} is part of the laboratory, which is not installed",
-                "pip install tactomo-lab, or `make setup` in a checkout",
-            )
+            raise not_installed(path.replace(".", " "))
         raise KeyError(name)
 
 

@@ -83,13 +83,13 @@ def method_option(default: str = "") -> Any:
     return typer.Option("--method", help=words, autocompletion=method_names, callback=_known_method)
 
 
-def methods_option(default: str) -> Any:
+def methods_option(default: str, **settings: Any) -> Any:
     """Return the option --method of a command that sets methods beside each other."""
     words = (
         f"Reconstruction method: a name, or your own my_module:MyMethod; may be repeated.{default}"
     )
     return typer.Option(
-        "--method", help=words, autocompletion=method_names, callback=_known_methods
+        "--method", help=words, autocompletion=method_names, callback=_known_methods, **settings
     )
 
 

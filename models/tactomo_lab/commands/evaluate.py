@@ -181,7 +181,6 @@ def _decibels(text: str) -> list[float]:
         "tactomo evaluate field --rows soft --picture soft_press.png",
         "tactomo evaluate field --rows graded,mixed --companion 0.05",
         "tactomo evaluate field --rows regimes --method auto,fit --picture flags.png",
-        "tactomo evaluate field --rows ordinary,moving --budget-ms 5 --budget-ms 50",
     )
 )
 def field(
@@ -191,14 +190,6 @@ def field(
         str | None, typer.Option(help="Which rows, with commas; or regimes. [all below]")
     ] = None,
     method: Annotated[list[str] | None, options.methods_option(" [auto]")] = None,
-    budget_ms: Annotated[
-        list[float] | None,
-        typer.Option(
-            min=0.1,
-            help="Work per frame, in ms of a 2.5 GHz core, of methods that it bounds; may be "
-            "repeated. [still: 2000; moving: the method's own]",
-        ),
-    ] = None,
     sensor: options.Description = options.DEFAULT_DESCRIPTION,
     companion: Annotated[
         float | None,
@@ -212,7 +203,7 @@ def field(
         Path | None,
         picture_option(
             "Draw one soft contact, the middle one by correlation: truth and method; of several "
-            "methods or budgets, an overview of all rows, with the time of a frame"
+            "methods, an overview of all rows"
         ),
     ] = None,
     as_json: options.JsonOutput = False,
@@ -245,12 +236,10 @@ def field(
 
     from tactomo_lab.commands.pictures import draw_overview, draw_press
     from tactomo_lab.evaluation.field import ROWS, STILL_ROWS, middle_press, scores_of_row
-    from tactomo_lab.evaluation.play import variants
     from tactomo_lab.evaluation.regimes import REGIMES, can_happen
     from tactomo_lab.scenes.measures import summarise
 
-    description = load_description(sensor)
-    methods = variants(method or ["auto"], [ms / 1e3 for ms in budget_ms or ()])
+    description, methods = load_description(sensor), method or ["auto"]
     usual = ROWS if companion is None else STILL_ROWS
     if rows in (None, "regimes"):
         all_rows = usual if rows is None else REGIMES
@@ -264,7 +253,7 @@ def field(
         lines_of = scores_of_row(description, row, one, seeds, count, companion)
         for line, frames in lines_of.items():
             try:
-                by_line.setdefault(line, {})[str(one)] = list(shown(frames, total, line))
+                by_line.setdefault(line, {})[one] = list(shown(frames, total, line))
             except ModelError as error:  # of a row's own sensor, for which a method may not serve
                 say(f"left out: {line}: {error}", err=True)
     scores = {
@@ -272,9 +261,8 @@ def field(
         for line, by_method in by_line.items()
         for one, own in by_method.items()
     }
-    names = list(map(str, methods))
     settings = _settings(
-        description.name, seeds, snr_of="change", method=", ".join(names), companion=companion
+        description.name, seeds, snr_of="change", method=", ".join(methods), companion=companion
     )
     found: dict[str, Summary] = {line: summarise(own) for line, own in scores.items()}
     lines = {
@@ -284,7 +272,7 @@ def field(
 
     def draw(output: Path) -> None:
         if len(methods) > 1:
-            draw_overview(by_line, names, output)
+            draw_overview(by_line, methods, output)
         else:
             draw_press(middle_press(description, methods[0], seeds, count), output)
 

@@ -12,7 +12,7 @@ import numpy as np
 from tactomo.cli.plot.plot import save_figure
 from tactomo_models.scene.press import strongest
 
-from tactomo_lab.scenes.measures import mean, summarise
+from tactomo_lab.scenes.measures import mean
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -117,10 +117,10 @@ def draw_press(
 
 def draw_overview(
     by_line: dict[str, dict[str, list[Score]]],  # scores of each line by each method
-    methods: Sequence[str],  # with their budgets, if any
+    methods: Sequence[str],
     output: Path,
 ) -> None:
-    """Draw lines by methods: mean ICC as colour, how many bad maps nothing warned of, and times.
+    """Draw lines by methods: mean ICC as colour, and how many bad maps nothing warned of.
 
     Raises TactomoError where the picture cannot be written.
     """
@@ -133,8 +133,7 @@ def draw_overview(
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots()
     image = axes.imshow(icc, vmin=0, vmax=1, cmap="viridis", aspect="auto")
-    heads = [f"{one}\n{1e3 * summarise(of_all[one]).seconds:.3g} ms" for one in methods]
-    axes.set_xticks(range(len(methods)), heads, rotation=30, ha="left", rotation_mode="anchor")
+    axes.set_xticks(range(len(methods)), methods, rotation=30, ha="left", rotation_mode="anchor")
     axes.set_yticks(range(len(rows)), [*by_line, "all"])
     axes.tick_params(top=True, bottom=False, labeltop=True, labelbottom=False, length=0)
     axes.axhline(len(rows) - 1.5, color="white", linewidth=3)
@@ -148,7 +147,7 @@ def draw_overview(
     figure.colorbar(image, ax=axes, label="mean ICC with the truth", aspect=30)
     legend = (
         "Red: maps with an ICC below 0.7 that no flag told to distrust, of all maps. "
-        "ms: median processor time of a frame. Blank: not for this sensor. Simulated."
+        "Blank: not for this sensor. Simulated."
     )
     figure.supxlabel(textwrap.fill(legend, int(13 * size[0])), fontsize=8)
     save_figure(figure, output, dpi=DPI)

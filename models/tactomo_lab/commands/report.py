@@ -108,17 +108,11 @@ def usable(sensor: SensorDescription, methods: Sequence[str]) -> list[str]:
 
     Raises TactomoError where none does.
     """
-    from tactomo_models import ModelError
-    from tactomo_models.methods.registry import check_method
+    from tactomo_lab.evaluation.trade_off import left_out
 
-    serving = []
-    for method in methods:
-        try:
-            check_method(method, sensor)
-        except ModelError as error:
-            say(f"left out: {method}: {error}", err=True)
-        else:
-            serving.append(method)
-    if not serving:
+    missing = left_out(sensor, methods)
+    for method, reason in missing.items():
+        say(f"left out: {method}: {reason}", err=True)
+    if len(missing) == len(methods):
         raise TactomoError("none of the methods is available", "choose others with --method")
-    return serving
+    return [method for method in methods if method not in missing]

@@ -24,7 +24,7 @@ from tactomo_lab.evaluation.moving import (
     mixed_sequence,
     palm_sequence,
 )
-from tactomo_lab.evaluation.play import Outcome, Variant, play
+from tactomo_lab.evaluation.play import Outcome, play
 from tactomo_lab.evaluation.regimes import REGIMES, make_case
 from tactomo_lab.scenes.case import Case, with_companion
 from tactomo_lab.scenes.drawing import SeedSet
@@ -53,7 +53,7 @@ SCENES_A_SEQUENCE = 10  # a moving scene has some 100 frames and takes a minute 
 def scores_of_row(
     description: SensorDescription,
     row: str,
-    method: str | Variant,
+    method: str,
     seed_set: SeedSet,
     count: int,
     companion: float | None = None,
@@ -135,7 +135,7 @@ def _still(
 
 
 def middle_press(
-    description: SensorDescription, method: str | Variant, seed_set: SeedSet, count: int
+    description: SensorDescription, method: str, seed_set: SeedSet, count: int
 ) -> Outcome:
     """One soft contact as a method has it: the scene whose ICC is the middle."""
     soft = cases_of_row(description, "soft", seed_set, count)["soft"]

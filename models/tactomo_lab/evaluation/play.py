@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from tactomo_models.batch import BUDGET_S
 from tactomo_models.drift.baseline import BaselineTracker
 from tactomo_models.errors import MethodError
-from tactomo_models.methods.registry import BUDGETED
 from tactomo_models.physics.artifact import load_or_build_artifact
 from tactomo_models.reconstruct import Reconstructor
 from tactomo_models.scans.reference import Reference
@@ -37,18 +36,14 @@ class Variant:
     budget_s: float | None = None
 
     def __str__(self) -> str:
-        budget = "" if self.budget_s is None else f", {self.budget_s * 1e3:g} ms"
-        return self.method + budget
+        return f"{self.method}, {self.budget_name}" if self.budget_name else str(self.method)
 
-
-def variants(methods: Iterable[str], budgets_s: Iterable[float] = ()) -> list[Variant]:
-    """Every method: those that a budget bounds under each of some, if there are any."""
-    of_bounded: list[float | None] = [*budgets_s] or [None]
-    return [
-        Variant(method, budget_s)
-        for method in methods
-        for budget_s in (of_bounded if method in BUDGETED else [None])
-    ]
+    @property
+    def budget_name(self) -> str:
+        """The budget in words, "20 ms"; nothing where there is none."""
+        if self.budget_s is None:
+            return ""
+        return f"{self.budget_s * 1e3:g} ms" if self.budget_s < 1 else f"{self.budget_s:g} s"
 
 
 @dataclass(frozen=True)

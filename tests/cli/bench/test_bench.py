@@ -1,8 +1,7 @@
-"""`tactomo bench`: what it measures, it tells of each scene."""
+"""`tactomo bench`: what is refused before the work."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from typing import Any
 
@@ -11,11 +10,14 @@ import pytest
 Run = Callable[..., Any]
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(180)
-def test_each_scene_is_measured(tactomo: Run) -> None:
-    result = tactomo("bench", "--seconds", 1, "--ports", 1, "--json")
-    assert result.returncode == 0, result.stderr
-    told = json.loads(result.stdout)
-    assert [phase["frames"] > 0 < phase["latency_p50_ms"] for phase in told["live"]] == [True] * 4
-    assert told["dropped_scans"] is not None
+def test_a_method_goes_with_the_chart(tactomo: Run) -> None:
+    assert tactomo("bench", "--method", "tikhonov").returncode == 2
+
+
+def test_without_the_laboratory_the_chart_says_how_to_get_it(
+    tactomo: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda **_: ())
+    result = tactomo("bench", "--chart", "chart.png")
+    assert result.returncode == 1
+    assert "pip install tactomo-lab" in result.stderr

@@ -42,21 +42,6 @@ def test_in_numbers_words_and_pictures(field: Run, tmp_path: Path) -> None:
     assert "dead-lead, auto" in words.stdout
 
 
-@pytest.mark.slow
-def test_a_budget_has_its_own_line(field: Run, tmp_path: Path) -> None:
-    picture = tmp_path / "budgets.png"
-    some = ("--rows", "soft", "--method", "fit,noser", "--budget-ms", 1, "--budget-ms", 200)
-    result = field(*some, "--count", 1, "--json", "--picture", picture)
-    assert result.returncode == 0, result.stderr
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    hasty, patient, linear = json.loads(result.stdout)["lines"].items()
-    assert [line for line, _ in (hasty, patient, linear)] == [
-        *("soft, fit, 1 ms", "soft, fit, 200 ms", "soft, noser")
-    ]
-    assert hasty[1]["icc"] < patient[1]["icc"]
-    assert hasty[1]["seconds"] < patient[1]["seconds"] <= patient[1]["seconds_99"]
-
-
 @pytest.mark.parametrize(
     ("option", "value", "why"),
     [

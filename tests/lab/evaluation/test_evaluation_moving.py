@@ -17,11 +17,12 @@ from tactomo_lab.evaluation.moving import (
     draw_sequence,
     follow,
 )
-from tactomo_lab.evaluation.play import Variant, play, variants
+from tactomo_lab.evaluation.play import Variant, play
+from tactomo_lab.evaluation.trade_off import measure
 from tactomo_lab.scenes.case import Case, Simulated, SimulatedVolts, as_described
 from tactomo_lab.scenes.drawing import BOTH_CHANNELS, GAP_M, gap_m, outline_of
-from tactomo_lab.scenes.measures import Score, summarise
-from tactomo_models import Artifact, Press, SensorDescription, SkinSimulator, available_methods
+from tactomo_lab.scenes.measures import Score
+from tactomo_models import Artifact, Press, SensorDescription, SkinSimulator
 from tactomo_models.scene.tracking import MAX_MISSED
 from tactomo_protocol import Channel
 
@@ -183,17 +184,12 @@ def test_speed_and_accuracy_are_of_all_frames(
     paper: SensorDescription, simulator: SkinSimulator
 ) -> None:
     scene = sequence(paper, simulator, Step("rest", {}), *[Step("still", {"A": press("A")})] * 2)
-    outcomes = list(play([scene], Variant("noser"), Variant("fit", 0.05)))
-    assert [str(one.variant) for one in outcomes] == ["noser"] * 3 + ["fit, 50 ms"] * 3
-    linear, fitted = (summarise([o.score for o in of]) for of in (outcomes[:3], outcomes[3:]))
-    assert linear.icc < fitted.icc < 1
-    assert 0 < linear.seconds <= linear.seconds_99
-
-
-def test_each_budget_is_of_the_methods_that_it_bounds() -> None:
-    asked = variants(available_methods(), (0.01, 2.0))
-    assert {v.method for v in asked} == set(available_methods())
-    assert [str(v) for v in asked if v.method in ("auto", "noser", "fit")] == [
-        *("auto, 10 ms", "auto, 2000 ms", "noser", "fit, 10 ms", "fit, 2000 ms")
+    done: list[None] = []
+    points = measure([scene], [Variant("noser"), Variant("fit", 0.05)], lambda: done.append(None))
+    assert [(p.scene, p.snr_db, str(p.variant), p.summary.frames) for p in points] == [
+        ("moving", 40.0, "noser", 3),
+        ("moving", 40.0, "fit, 50 ms", 3),
     ]
-    assert list(map(str, variants(["auto", "noser"]))) == ["auto", "noser"]
+    assert len(done) == 6
+    assert points[0].icc < points[1].icc < 1
+    assert 0 < points[0].p50_s <= points[0].summary.seconds_99

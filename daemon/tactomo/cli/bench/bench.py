@@ -1,8 +1,9 @@
 """`tactomo bench`: how fast all this is on the machine at hand.
 
-A twin and a daemon as processes of their own, and this process as the subscriber; latency
+*Live*: a twin and a daemon as processes of their own, and this process as the subscriber; latency
 is from the moment at which the daemon has read the last byte of a dual scan to the arrival of its
-contacts here, by the clock that both processes share.
+contacts here, by the clock that both processes share. *Chart* is the laboratory's, see
+`tactomo.cli.laboratory`.
 """
 
 from __future__ import annotations
@@ -15,11 +16,12 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tactomo.cli import options
+from tactomo.cli.laboratory import measurement
 from tactomo.cli.output import print_json, table
 
 if TYPE_CHECKING:
@@ -27,11 +29,14 @@ if TYPE_CHECKING:
     from tactomo_client import Frame, Subscription
     from tactomo_models import SensorDescription
 
+    from tactomo.cli.console import Console
+
 SENSOR = "bench"
 SETTLE_S = 1.5
 STATUS_S = 13.0  # at 20 dual scans a second: as far back as the stage times in a status go
 START_S = 60.0
 PLACES = ((0.0, 0.1), (-0.45, -0.4), (0.5, -0.35))  # in shares of half the sheet's size
+LIVE, CHART = "Live", "Speed against accuracy"
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,7 @@ class Results:
     live: list[Phase] = field(default_factory=list)
     late_scans: int | None = None
     dropped_scans: int | None = None
+    chart: list[dict[str, Any]] = field(default_factory=list)
 
 
 app = options.typer_app()
@@ -67,27 +73,58 @@ app = options.typer_app()
         "tactomo bench",
         "tactomo bench --seconds 20 --ports 1",
         "tactomo bench --json > times.json",
+        "tactomo bench --chart speed_accuracy.png --count 25",
+        "tactomo bench --chart mine.png --method my_module:MyMethod --method auto",
     )
 )
 def bench(
     description: options.Description = options.DEFAULT_DESCRIPTION,
     seconds: Annotated[
         float,
-        typer.Option(min=1.0, help="Seconds of each of the four scenes."),
+        typer.Option(
+            min=1.0, rich_help_panel=LIVE, help="Seconds of each of the four live scenes."
+        ),
     ] = STATUS_S,
     ports: Annotated[
         int | None,
-        typer.Option(min=1, max=2, help="Lines of the twin. [one a channel]"),
+        typer.Option(min=1, max=2, rich_help_panel=LIVE, help="Lines of the twin. [one a channel]"),
     ] = None,
-    rate: Annotated[float, typer.Option(help="Dual scans a second of the twin.")] = 20.0,
+    rate: Annotated[
+        float, typer.Option(rich_help_panel=LIVE, help="Dual scans a second of the twin.")
+    ] = 20.0,
+    chart: Annotated[
+        Path | None,
+        typer.Option(
+            rich_help_panel=CHART,
+            help="Instead, draw every method's accuracy over its time: .png, .svg or .pdf. "
+            "Needs matplotlib.",
+        ),
+    ] = None,
+    count: Annotated[
+        int,
+        typer.Option(min=1, rich_help_panel=CHART, help="Still scenes each of 1 to 4 contacts."),
+    ] = 10,
+    method: Annotated[
+        list[str] | None, options.methods_option(" [every installed one]", rich_help_panel=CHART)
+    ] = None,
     as_json: options.JsonOutput = False,
 ) -> None:
-    """Measure latency and rate on this machine.
+    """Measure latency and rate on this machine, or the accuracy of methods over their time.
 
     Starts a twin and a daemon on free addresses, presses the twin in four ways and measures each. A
     running demo is not disturbed, but shares the processor. Takes about a minute.
+
+    With `--chart`, every method reconstructs simulated presses of mixed kinds on hand-made skins
+    (reporting seeds): still scenes at 40, 20 and 10 dB, each from a cold start, and moving scenes,
+    under budgets of 1 to 50 ms, still ones also of 2 s. Takes about a quarter of an hour, longer
+    when the scenes must be simulated first.
     """
+    if method and chart is None:
+        raise typer.BadParameter("--method goes with --chart")
     results = Results(machine(), description)
+    if chart is not None:
+        _chart(results, chart, count, method or [], as_json)
+        return
     from tactomo.cli.console import Console
 
     with Console(stderr=True).status("starting") as line:
@@ -96,6 +133,16 @@ def bench(
         print_json(asdict(results))
     else:
         _print(results)
+
+
+def _chart(results: Results, picture: Path, count: int, methods: list[str], as_json: bool) -> None:
+    results.chart, fronts = measurement("chart")(
+        results.description, picture, count, results.machine, methods
+    )
+    if as_json:
+        print_json(asdict(results))
+    else:
+        _console(results).print(fronts)
 
 
 def _measure_twin(
@@ -199,16 +246,22 @@ def _spot(description: SensorDescription, place: tuple[float, float]) -> tuple[f
 
 
 def _print(results: Results) -> None:
-    from tactomo.cli.console import page
-
-    console = page()
-    console.print(f"{results.machine}, sensor {results.description}")
+    console = _console(results)
     console.print(_live_table(results))
     console.print(_stage_table(results.live))
     console.print(
         f"late scans of the twin: {results.late_scans}; "
         f"dual scans dropped by the daemon: {results.dropped_scans}"
     )
+
+
+def _console(results: Results) -> Console:
+    """Return where to print, and say there on what everything was measured."""
+    from tactomo.cli.console import page
+
+    console = page()
+    console.print(f"{results.machine}, sensor {results.description}")
+    return console
 
 
 def _live_table(results: Results) -> Table:

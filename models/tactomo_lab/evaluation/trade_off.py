@@ -1,0 +1,109 @@
+"""Speed against accuracy: every method under every budget, on the same scenes.
+
+Two kinds of scene. *Still*: each by itself from a cold start, so that a budget which ends early
+leaves what one frame could do. *Moving*: frame after frame as the daemon has them, so that what
+one frame does not finish the next one goes on with; every frame is reconstructed, however long
+that takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from tactomo_models.batch import BUDGET_S
+from tactomo_models.errors import ModelError
+from tactomo_models.methods.registry import BUDGETED, check_method
+from tactomo_models.reconstruct import DEFAULT_BUDGET_S
+from tactomo_models.sensor.description import SensorDescription
+
+from tactomo_lab.evaluation.play import Variant, play
+from tactomo_lab.scenes.case import Case
+from tactomo_lab.scenes.measures import Score, Summary, summarise
+
+SceneKind = Literal["still", "moving"]
+Done = Callable[[], None]
+
+UNHURRIED: Final = ("levelset",)  # charted under the last budget alone
+BUDGETS_S: Final = (0.001, 0.002, 0.005, 0.01, 0.02, DEFAULT_BUDGET_S)
+STILL_BUDGETS_S: Final = (*BUDGETS_S, BUDGET_S)  # the last one: as much as a scene needs
+
+
+def variants(methods: Iterable[str], budgets_s: Sequence[float] = BUDGETS_S) -> list[Variant]:
+    """Every method: `auto` under each of some budgets, others that one bounds under the last."""
+    chosen = []
+    for method in methods:
+        if method not in BUDGETED:
+            chosen.append(Variant(method))
+        else:
+            budgets = budgets_s[-1:] if method in UNHURRIED else budgets_s
+            chosen += [Variant(method, budget_s) for budget_s in budgets]
+    return chosen
+
+
+@dataclass(frozen=True)
+class Point:
+    """How fast and how right a variant is on scenes of one kind."""
+
+    scene: SceneKind
+    snr_db: float
+    variant: Variant
+    summary: Summary
+
+    @property
+    def icc(self) -> float:
+        """Mean correlation of the maps with the truth."""
+        return self.summary.icc
+
+    @property
+    def p50_s(self) -> float:
+        """Median processor time of a frame."""
+        return self.summary.seconds
+
+
+def measure(
+    cases: Sequence[Case], variants: Sequence[Variant], done: Done = lambda: None
+) -> list[Point]:
+    """Play cases of one kind and one ratio; `done` is called after each frame."""
+    scores: dict[Variant, list[Score]] = {variant: [] for variant in variants}
+    for outcome in play(cases, *variants):
+        scores[outcome.variant].append(outcome.score)
+        done()
+    first = cases[0]
+    kind: SceneKind = "still" if first.is_still else "moving"
+    return [
+        Point(kind, first.plan.snr_db, variant, summarise(own)) for variant, own in scores.items()
+    ]
+
+
+def left_out(description: SensorDescription, methods: Iterable[str]) -> dict[str, str]:
+    """Methods that are not to be had for a sensor, and why: a network that nobody trained."""
+    reasons = {}
+    for method in methods:
+        try:
+            check_method(method, description)
+        except ModelError as error:
+            reasons[method] = str(error)
+    return reasons
+
+
+def panels(points: Iterable[Point]) -> Iterator[list[Point]]:
+    """Points that can be compared: of one kind of scene and one signal-to-noise ratio."""
+    groups: dict[tuple[SceneKind, float], list[Point]] = {}
+    for point in points:
+        groups.setdefault((point.scene, point.snr_db), []).append(point)
+    yield from groups.values()
+
+
+def pareto_front(points: Sequence[Point]) -> list[Point]:
+    """Points than which none is both as fast and as right, and better in one; fastest first."""
+    known = [point for point in points if np.isfinite(point.icc)]
+    best = [one for one in known if not any(_dominates(other, one) for other in known)]
+    return sorted(best, key=lambda point: point.p50_s)
+
+
+def _dominates(one: Point, other: Point) -> bool:
+    as_good = one.p50_s <= other.p50_s and one.icc >= other.icc
+    return as_good and (one.p50_s < other.p50_s or one.icc > other.icc)

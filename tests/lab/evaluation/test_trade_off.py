@@ -1,0 +1,95 @@
+"""Speed against accuracy: what is on the Pareto front, and that what is asked for is measured."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tactomo_lab.evaluation.play import Variant
+from tactomo_lab.evaluation.trade_off import (
+    Point,
+    left_out,
+    measure,
+    panels,
+    pareto_front,
+    variants,
+)
+from tactomo_lab.scenes.measures import summarise
+from tactomo_lab.scenes.still_scenes import scenes
+from tactomo_models import Artifact, SensorDescription, available_methods
+from tactomo_models.methods.registry import BUDGETED
+
+
+def point(p50_s: float, icc: float, snr_db: float = 40.0) -> Point:
+    return Point("still", snr_db, Variant("auto"), replace(NOTHING, icc=icc, seconds=p50_s))
+
+
+NOTHING = summarise([])
+FEW = st.sampled_from([0.1, 0.2, 0.3, 0.5])  # so that some are equal
+
+
+@given(st.lists(st.builds(point, FEW, FEW | st.just(float("nan"))), max_size=12))
+def test_nothing_is_better_than_the_front_and_the_front_is_better_than_all_else(
+    points: list[Point],
+) -> None:
+    front = pareto_front(points)
+
+    def better(one: Point, other: Point) -> bool:
+        return (one.p50_s, -one.icc) != (other.p50_s, -other.icc) and (
+            one.p50_s <= other.p50_s and one.icc >= other.icc
+        )
+
+    for on in front:
+        assert not any(better(one, on) for one in points)
+    for off in points:
+        if not any(off is on for on in front):
+            assert np.isnan(off.icc) or any(better(on, off) for on in front)
+    assert [on.p50_s for on in front] == sorted(on.p50_s for on in front)
+
+
+def test_points_that_cannot_be_compared_are_not() -> None:
+    points = [point(1, 0.9), point(2, 0.8, snr_db=20), point(3, 0.7)]
+    assert list(panels(points)) == [[points[0], points[2]], [points[1]]]
+
+
+def test_every_method_has_a_point_and_auto_and_fit_one_for_every_budget() -> None:
+    chosen = variants(available_methods(), (0.01, 2.0))
+    assert {v.method for v in chosen} == set(available_methods())
+    assert [str(v) for v in chosen if v.method in ("auto", "fit", "levelset", "noser")] == [
+        "auto, 10 ms",
+        "auto, 2 s",
+        "noser",
+        "fit, 10 ms",
+        "fit, 2 s",
+        "levelset, 2 s",
+    ]
+    assert all((v.budget_s is None) is (v.method not in BUDGETED) for v in chosen)
+
+
+@pytest.mark.slow
+def test_still_scenes_are_measured_under_each_budget(
+    paper: SensorDescription, artifact: Artifact, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tactomo_lab.evaluation.play.load_or_build_artifact", lambda _: artifact)
+    drawn = list(scenes(paper, "tuning", 1, contacts=(3,), snr_db=20))
+    asked = [Variant("tikhonov"), Variant("fit", 0.001), Variant("fit", 0.2)]
+    done: list[None] = []
+    linear, hasty, patient = measure(drawn, asked, lambda: done.append(None))
+    assert [linear.variant, hasty.variant, patient.variant] == asked
+    assert len(done) == 3
+    assert {p.summary.frames for p in (linear, hasty, patient)} == {1}
+    assert {(p.scene, p.snr_db) for p in (linear, hasty, patient)} == {("still", 20.0)}
+    assert hasty.icc < patient.icc > linear.icc
+    # A millisecond of work is about what a linear image takes.
+    assert max(linear.p50_s, hasty.p50_s) < patient.p50_s <= patient.summary.seconds_99
+    assert hasty.summary.distrusted == 1
+
+
+def test_methods_whose_network_nobody_trained_are_left_out(small: SensorDescription) -> None:
+    missing = left_out(small, available_methods())
+    assert {"network", "cnn-single"} <= missing.keys()
+    assert not {"auto", "levelset", "noser"} & missing.keys()
+    assert all(missing.values())
