@@ -476,7 +476,6 @@ class PortReader(Worker):
     def _end(self) -> None:
         self.has_ended = True
         self._deliver(Delivery(self.index, 0, (), has_ended=True, replay_pass=self._pass))
-        self._tell("replay_ended", "the recording has ended")
 
     def _begin_pass(self, number: int) -> None:
         """Go on elsewhere in the recording: what had begun to come is not finished."""

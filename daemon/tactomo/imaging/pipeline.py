@@ -212,6 +212,7 @@ class Pipeline(Worker):
                     self._move(0.0)
                 elif not self.finished.is_set():
                     self.finished.set()
+                    self._on_event("replay_ended", "the recording has ended")
                     self._imaging.tell_status()
 
     @property

@@ -8,7 +8,7 @@ const FINER = 5;           // intervals of the smooth image for each one of the 
 const OUTLINE_FINER = 3;
 const ELECTRODE_MM = [6, 2.4];  // drawn size: along the rim, across it
 const NARROW_PX = 520;     // below this the colour bar lies under the map
-const TICK_PX = 40;        // the least room of a number under the map
+const TICK_PX = 28;        // the least room of a number under the map
 
 /** The corners of a sheet's bounding box. */
 function box({ x: [x0, x1], y: [y0, y1] }) {
@@ -369,18 +369,15 @@ export class MapView {
     c.font = `12px ${theme.font}`;
     c.textBaseline = narrow ? "top" : "middle";
     c.textAlign = narrow ? "center" : "left";
-    const marks = ticks(0, scale, narrow ? Math.min(5, bar.w / (TICK_PX + 15)) : 5);
-    marks.forEach((value, i) => {
-      const isLast = i === marks.length - 1;
-      if (narrow && isLast) c.textAlign = "right";
-      if (narrow) c.fillText(isLast ? `${number(value)} ${unit}` : number(value), bar.x + (value / scale) * bar.w + (isLast ? 10 : 0), bar.y + 16);
+    for (const value of ticks(0, scale, narrow ? Math.min(5, bar.w / TICK_PX) : 5)) {
+      if (narrow) c.fillText(number(value), bar.x + (value / scale) * bar.w, bar.y + 16);
       else c.fillText(number(value), bar.x + bar.w + 6, bar.y + bar.h * (1 - value / scale) + 0.5);
-    });
-    if (narrow) return;
-    c.fillStyle = theme.dim;
-    c.textAlign = "left";
-    c.textBaseline = "top";
-    c.fillText(unit, bar.x - 2, bar.y + bar.h + 13);
+    }
+    c.textAlign = narrow ? "right" : "left";
+    c.textBaseline = narrow ? "middle" : "top";
+    c.fillStyle = narrow ? rgb(table, 0) : theme.dim;  // in the bar's bright end
+    if (narrow) c.font = `600 10px ${theme.font}`;
+    c.fillText(unit, narrow ? bar.x + bar.w - 4 : bar.x - 2, bar.y + (narrow ? bar.h / 2 + 0.5 : bar.h + 13));
   }
 }
 
