@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
 from tactomo_models.archive import read_arrays, write_whole
@@ -19,6 +20,7 @@ from tactomo_models.errors import CalibrationError, DataError
 from tactomo_models.growing_arrays import GrowingArrays
 from tactomo_models.reconstruct import Reconstructor
 from tactomo_models.scans.reference import Reference
+from tactomo_models.scans.repeats import Repeats
 from tactomo_models.scene.contacts import Contact
 from tactomo_models.scene.pressure import PressureCurve
 from tactomo_models.scene.reconstruction import Reconstruction
@@ -65,6 +67,7 @@ class Reconstructed(NamedTuple):
     frames: int
     failed: int  # frames of another method than the one asked for
     failure: str  # of the first of these: why
+    repeated: int  # scans that were left out: earlier ones over again, where scans at rest differ
 
 
 class ReferencedScans(NamedTuple):
@@ -91,7 +94,8 @@ def reconstruct_file(
     Args:
         source: .npz with `magnitude` (T, M), `structure` (T, M), `magnitude_reference` (M,) or
             (n, M) and `structure_reference` likewise, volts on any common scale. A channel that is
-            missing or all NaN is taken as absent.
+            missing or all NaN is taken as absent, as is a scan that repeats an earlier one though
+            scans at rest had noise: of a frozen converter, or a frame that was doubled.
         target: .npz that is written; docs/files.md says what is in it.
         description: the sensor.
         method: its name, see `methods.registry`.
@@ -115,7 +119,8 @@ def reconstruct_file(
         **VECTORS,
         **dict.fromkeys(IMAGES, (description.map.nodes_y, description.map.nodes_x)),
     }
-    failed, failure = 0, ""
+    failed, failure, repeated = 0, "", 0
+    repeats = Repeats(description.pairs)
     total = max(len(channel) for channel in scans.values())
     try:
         with (
@@ -131,10 +136,14 @@ def reconstruct_file(
             )
             reconstructor.set_reference(reference)
             for index in range(total):
-                magnitude, structure = (_scan(scans, n, index) for n in ("magnitude", "structure"))
+                taken = {name: _scan(scans, name, index) for name in Channel}
+                for name, scan in taken.items():
+                    found = None if scan is None else repeats.find(name, scan, reference)
+                    if found is not None and not found.parts and found.voltages.all():
+                        taken[name], repeated = None, repeated + 1
                 start = time.perf_counter()
                 companions = [(name, float(each[index])) for name, each in readings.items()]
-                frame = reconstructor.reconstruct(magnitude, structure, companions=companions)
+                frame = reconstructor.reconstruct(*taken.values(), companions=companions)
                 arrays.append({"seconds": time.perf_counter() - start, **_frame_row(frame)})
                 for contact in frame.contacts:
                     arrays.append(_contact_row(index, contact))
@@ -147,7 +156,7 @@ def reconstruct_file(
         raise DataError(
             f"cannot write {target}: {error.strerror}; name a file in a folder that you may write"
         ) from error
-    return Reconstructed(total, failed, failure)
+    return Reconstructed(total, failed, failure, repeated)
 
 
 def _folder_of(target: Path) -> Path:

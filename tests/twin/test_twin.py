@@ -482,3 +482,10 @@ def test_more_voltages_than_a_scan_can_have_are_told_at_the_start(
 def test_a_sensor_of_one_channel_has_no_two_ports() -> None:
     with pytest.raises(ConfigError, match="1 channel"):
         TwinConfig(load_description("tank_disc"), ports=2)
+
+
+def test_an_emulated_board_without_companions_is_told_at_the_start() -> None:
+    raw = load_description("openeit_disc").model_dump(by_alias=True, exclude_none=True)
+    raw["companion"] = {"cell": {"gain_n_per_unit": 1.0, "noise_n": 0.1}}
+    with pytest.raises(ConfigError, match=r"companion, cell, .* of protocol openeit sends no"):
+        TwinConfig(SensorDescription.model_validate(raw), protocol="openeit")

@@ -129,6 +129,13 @@ class TwinConfig:
                 f"{self.protocol} carries one",
                 "give the description of a sensor with one channel, such as tank_disc",
             )
+        companion = next(iter(self.description.companion), None)
+        if self.protocol != NATIVE and companion is not None:
+            raise ConfigError(
+                f"{self.description.name} has a companion, {companion}, and the twin's device of "
+                f"protocol {self.protocol} sends no readings",
+                f"leave [companion] out, or give the protocol {NATIVE}",
+            )
         if not RATE_HZ_MIN <= self.rate_hz <= RATE_HZ_MAX:
             raise ConfigError(
                 f"a rate of {self.rate_hz:g} Hz is out of range",

@@ -54,6 +54,27 @@ def test_a_press_is_found_in_a_file(tactomo: Run, tmp_path: Path) -> None:
         assert maps["pressure_kpa"][1].max() == pytest.approx(maps["contact_pressure_kpa"][0])
 
 
+def test_scans_that_repeat_earlier_ones_are_left_out_and_told(tactomo: Run, tmp_path: Path) -> None:
+    """As the daemon does, where scans at rest show that a converter at work has noise."""
+    [volts] = SkinSimulator(load_description("tank_disc")).voltages([]).values()
+    noise = 1e-4 * np.abs(volts).mean() * np.random.default_rng(0).normal(size=(30, len(volts)))
+    rest, live = volts + noise[:20], volts + noise[20:]
+    np.savez(
+        tmp_path / "in.npz",
+        allow_pickle=False,
+        structure=np.vstack([live, np.repeat(live[-1:], 5, axis=0)]),
+        structure_reference=rest,
+    )
+    result = tactomo("reconstruct", "in.npz", "out.npz", "-d", "tank_disc")
+    assert result.returncode == 0
+    assert "left out: 5 scans that repeat earlier ones" in result.stderr
+    assert "5 of 15 frames are flagged no_usable_scan" in result.stdout
+    with np.load(tmp_path / "out.npz") as maps:
+        assert [bool(Flag(int(each)) & Flag.NO_USABLE_SCAN) for each in maps["flags"]] == (
+            [False] * 10 + [True] * 5
+        )
+
+
 @pytest.mark.parametrize("layout", ["named", "plain"])
 def test_companions_of_a_file_are_judged_in_every_layout(
     tactomo: Run, tmp_path: Path, layout: str

@@ -163,6 +163,13 @@ def reconstruct(
                 )
             if file == maps:
                 say(f"wrote {maps}: {made.frames} frames")
+            if file == maps and made.repeated:
+                say(
+                    f"left out: {counted(made.repeated, 'scan')} that repeat earlier ones, though "
+                    "scans at rest have noise; either the converter is frozen, or the file holds "
+                    "frames twice",
+                    err=True,
+                )
         if not maps.is_file():  # such as /dev/null
             return
         from tactomo.cli.files.reconstructed import draw_methods, print_summary
