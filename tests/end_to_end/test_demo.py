@@ -101,7 +101,7 @@ def test_the_readme_subscribes_in_six_lines(demo: Demo, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
 def test_a_demo_that_ends_leaves_no_process_behind(number: signal.Signals, tmp_path: Path) -> None:
     sensor = tmp_path / "small.toml"
     sensor.write_text(SMALL)

@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from typing import Any, Self
 
 from tactomo.cli.parent_watch import VARIABLE
-from tactomo.ending import at_end
+from tactomo.ending import AS_WELL, ASKED, at_end
 from tactomo.errors import TactomoError
 
 VIEWER_SAYS = "viewer: "
@@ -170,12 +170,11 @@ class Family:
 
 
 class no_interruption:  # noqa: N801 - reads as a statement
-    """A block during which Ctrl-C and SIGTERM are ignored: what stops everything must finish."""
+    """A block during which signals to end are ignored: what stops everything must finish."""
 
     def __enter__(self) -> None:
         self._before = {
-            number: signal.signal(number, signal.SIG_IGN)
-            for number in (signal.SIGINT, signal.SIGTERM)
+            number: signal.signal(number, signal.SIG_IGN) for number in (*ASKED, *AS_WELL)
         }
 
     def __exit__(self, *_: object) -> None:
@@ -184,22 +183,21 @@ class no_interruption:  # noqa: N801 - reads as a statement
 
 
 def new_family(verbose: bool = False) -> Family:
-    """Return a new family, which SIGTERM ends as Ctrl-C does.
-
-    SIGINT ends it, too, where a shell had it ignored, as it does for what it starts with `&`.
-    """
-    interrupt_on_sigterm()
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Return a new family, which any signal to end ends as Ctrl-C does."""
+    interrupt_at_end()
     return Family(verbose)
 
 
-def interrupt_on_sigterm() -> None:
-    """Let SIGTERM unwind the main thread as Ctrl-C does."""
+def interrupt_at_end() -> None:
+    """Let any signal to end, such as a closed terminal's, unwind the main thread as Ctrl-C does.
+
+    Ctrl-C does, too, where a shell had it ignored, as it does for what it starts with `&`.
+    """
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    signal.signal(signal.SIGTERM, interrupt)
+    at_end(interrupt)
 
 
 def stop_asked() -> threading.Event:

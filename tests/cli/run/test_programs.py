@@ -82,7 +82,7 @@ def test_a_twin_of_the_papers_sensor(start: Run, tmp_path: Path) -> None:
         wait_until(six_scans)
     assert {len(scan.samples) for scan in scans} == {208}
     assert request("status", ready["control"], PATIENCE_S)["sensor"] == "paper_square"
-    twin.send_signal(signal.SIGTERM)
+    twin.send_signal(signal.SIGHUP)
     assert twin.wait(PATIENCE_S) == 0
     assert not os.path.lexists(tmp_path / "dev" / "skin")
 

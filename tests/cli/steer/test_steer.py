@@ -5,6 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from threading import Timer
@@ -17,6 +20,7 @@ from tactomo.running import Running, announced
 from tactomo.service.health_issues import FLAG_ADVICE, health_issues
 from tactomo_client.fake import FakeSensor
 from tactomo_models import Flag
+from waiting import PATIENCE_S, wait_until
 
 Run = Callable[..., Any]
 
@@ -316,6 +320,24 @@ def test_record_a_file_for_some_seconds(
     assert result.stdout.endswith("recorded /x.mcap (1.23 MB)\n")
     asked = [command for command, _ in control.requests]
     assert asked == ["record_start", *["status"] * 3, "record_stop"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_recording_ends_with_the_command_and_its_terminal(
+    control: Any, number: signal.Signals
+) -> None:
+    """The daemon went on to record, until its disk was full."""
+    control.answers["record_start"] = {"path": "/x.mcap"}
+    control.answers["record_stop"] = {"path": "/x.mcap", "bytes": 1_230_000}
+    control.answers["status"] = STATUS
+    command = [sys.executable, "-m", "tactomo.cli", "record", "x.mcap"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        wait_until(lambda: "status" in [asked for asked, _ in control.requests], "the recording")
+        process.send_signal(number)
+        said, _ = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0
+    assert said.endswith("recorded /x.mcap (1.23 MB)\n")
+    assert control.requests[-1][0] == "record_stop"
 
 
 def test_tier_and_budget(tactomo: Run, control: Any) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import typer
 
-from tactomo.cli.children import interrupt_on_sigterm
+from tactomo.cli.children import interrupt_at_end
 from tactomo.cli.output import progress_bar, say
 from tactomo.errors import RecordingError, TactomoError
 
@@ -188,7 +188,7 @@ def _reconstructed(given: Recording, known: SensorDescription, folder: Path) -> 
     """Replay each file of a recording through a daemon of our own, into one that has frames."""
     from tactomo_client.recording import open_recording
 
-    interrupt_on_sigterm()
+    interrupt_at_end()
     made: list[Recording] = []
     for file in given.files:
         _reconstruct_file(file, given.sensor, known, folder / file.name)

@@ -55,11 +55,11 @@ def twin(
     """
     from tactomo_models import load_description
 
-    from tactomo.cli.children import interrupt_on_sigterm, print_ready
+    from tactomo.cli.children import interrupt_at_end, print_ready
     from tactomo.running import Running, announced
     from tactomo.twin import Twin, TwinConfig, load_scene
 
-    interrupt_on_sigterm()
+    interrupt_at_end()
     sensor = load_description(description)
     lines = len(sensor.channels) if protocol == "tactomo" else 1
     config = TwinConfig(

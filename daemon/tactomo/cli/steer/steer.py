@@ -223,6 +223,9 @@ def _untared(twin: str) -> str:
 def _record_for(daemon: Daemon, name: str, seconds: float | None, maps: bool | None) -> None:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+    from tactomo.cli.children import interrupt_at_end
+
+    interrupt_at_end()  # the daemon would go on, and fill its disk
     size = TextColumn("{task.fields[size]}")
     columns = (TextColumn("recording"), BarColumn(), TimeElapsedColumn(), size)
     with (
