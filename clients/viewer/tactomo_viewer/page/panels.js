@@ -169,7 +169,7 @@ function showChannels({ state, ports, rates, events, companions = {}, companion_
     return item;
   });
   lines.forEach(([kind, name, text], i) => {
-    list.children[i].className = i < issues.length ? "issue" : "";
+    list.children[i].className = i < issues.length || name.length > 24 ? "issue" : "";
     const [dot, label, value] = list.children[i].children;
     dot.dataset.kind = kind;
     dot.title = kind;
