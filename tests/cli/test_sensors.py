@@ -6,7 +6,6 @@ import contextlib
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -16,7 +15,7 @@ from tactomo.cli.sensors import twin_of
 from tactomo.endpoint import free_addresses
 from tactomo.running import Running, announced, running
 from tactomo_client.fake import FakeSensor
-from waiting import PATIENCE_S
+from waiting import PATIENCE_S, repeated
 
 Run = Callable[..., Any]
 
@@ -40,18 +39,12 @@ def announcing(*programs: Running) -> Iterator[None]:
 @contextlib.contextmanager
 def telling(sensor: str, **status: Any) -> Iterator[FakeSensor]:
     """Publish a sensor's status, over and over."""
-    stop = threading.Event()
-    with FakeSensor(sensor) as fake:
-
-        def publish() -> None:
-            while not stop.wait(0.05):
-                fake.publish_message("status", {"sensor": sensor, "state": "running", **status})
-
-        thread = threading.Thread(target=publish)
-        thread.start()
+    said = {"sensor": sensor, "state": "running", **status}
+    with (
+        FakeSensor(sensor) as fake,
+        repeated(lambda: fake.publish_message("status", said)),
+    ):
         yield fake
-        stop.set()
-        thread.join()
 
 
 def test_the_only_sensor_is_found(tactomo: Run) -> None:

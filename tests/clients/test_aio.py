@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import gc
-import threading
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from typing import Any
 
@@ -18,6 +17,7 @@ from tactomo_client import (
     aio,
 )
 from tactomo_client.fake import FakeSensor
+from waiting import repeated
 
 Run = Callable[[Coroutine[Any, Any, None]], None]
 CONTACT = Contact(3, 10.0, -20.0, 700.0, 0.15, 0.01, 170.0)
@@ -45,17 +45,8 @@ async def within(main: Awaitable[None]) -> None:
 @pytest.fixture
 def pressed(sensor: FakeSensor) -> Iterator[FakeSensor]:
     """The sensor, publishing frames from a thread of its own."""
-    stop = threading.Event()
-
-    def publish() -> None:
-        while not stop.wait(0.005):
-            sensor.publish([CONTACT])
-
-    thread = threading.Thread(target=publish)
-    thread.start()
-    yield sensor
-    stop.set()
-    thread.join()
+    with repeated(lambda: sensor.publish([CONTACT]), 0.005):
+        yield sensor
 
 
 def test_frames_come_to_several_subscriptions_in_one_loop(run: Run, pressed: FakeSensor) -> None:

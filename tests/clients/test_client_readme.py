@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -19,7 +18,7 @@ from tactomo.recordings.recording_writer import RecordingWriter, message_entry
 from tactomo_client import Contact, ControlError, aio
 from tactomo_client.fake import FakeSensor
 from tactomo_client.messages import MAP, encode_message
-from waiting import wait_until
+from waiting import repeated, wait_until
 
 README = (Path(__file__).parents[2] / "clients" / "python" / "README.md").read_text("utf-8")
 EXAMPLES = {
@@ -75,13 +74,11 @@ def test_there_is_a_test_of_every_example() -> None:
 @pytest.fixture
 def pressed(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeSensor]:
     """A sensor of the README's name, where `subscribe` looks by default, pressed all the time."""
-    stop = threading.Event()
 
     def publish() -> None:
-        while not stop.wait(0.02):
-            sensor.publish([CONTACT])
-            sensor.publish_message("status", {"state": "running"})
-            sensor.publish_message("event", {"name": "tared", "detail": "a new reference"})
+        sensor.publish([CONTACT])
+        sensor.publish_message("status", {"state": "running"})
+        sensor.publish_message("event", {"name": "tared", "detail": "a new reference"})
 
     def here(subscribe: Callable[..., Any]) -> Callable[..., Any]:
         return lambda name, **options: subscribe(name, **{"address": sensor.address} | options)
@@ -89,11 +86,8 @@ def pressed(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeSensor]:
     with FakeSensor("left_forearm") as sensor:
         for module in (tactomo_client, aio):
             monkeypatch.setattr(module, "subscribe", here(module.subscribe))
-        thread = threading.Thread(target=publish)
-        thread.start()
-        yield sensor
-        stop.set()
-        thread.join()
+        with repeated(publish, 0.02):
+            yield sensor
 
 
 @pytest.fixture

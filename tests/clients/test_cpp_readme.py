@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import subprocess
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from needs import need
 from page import Page
 from tactomo_client import Contact
 from tactomo_client.fake import FakeSensor
+from waiting import repeated
 
 README = Page("clients/cpp/README.md")
 ROOT = Path(__file__).parents[2]
@@ -29,18 +29,8 @@ pytestmark = pytest.mark.timeout(600)  # compilers are slow where others work, t
 @pytest.fixture(scope="module")
 def pressed() -> Iterator[str]:
     """Where a sensor of the README's name is pressed all the time."""
-    stop = threading.Event()
-
-    def publish() -> None:
-        while not stop.wait(0.02):
-            sensor.publish([CONTACT])
-
-    with FakeSensor("skin") as sensor:
-        thread = threading.Thread(target=publish)
-        thread.start()
+    with FakeSensor("skin") as sensor, repeated(lambda: sensor.publish([CONTACT]), 0.02):
         yield sensor.address
-        stop.set()
-        thread.join()
 
 
 class Checkout:

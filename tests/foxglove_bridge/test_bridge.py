@@ -27,7 +27,7 @@ from tactomo_client.messages import encode_message
 from tactomo_foxglove import Bridge, BridgeError
 from tactomo_models import load_description
 from variants import variant
-from waiting import PATIENCE_S
+from waiting import PATIENCE_S, repeated
 
 PRESSED = 50
 DESCRIPTION = description_fields(load_description("paper_square"))
@@ -160,26 +160,19 @@ def test_a_mounted_sheet_is_drawn_on_its_surface(sensor: FakeSensor) -> None:
     status = {**STATUS, "description": sheet}
     up: dict[str, Any] = {"position_m": (0.05, 0.0, 0.01), "normal": (1.0, 0.0, 0.0)}
     contact = Contact(1, 0.0, 10.0, 700.0, 0.1, 0.01, 170.0, force_n=8.0, frame="arm", **up)
-    stop = threading.Event()
+    image = np.zeros((51, 51), np.float32)
 
     def say() -> None:
-        image = np.zeros((51, 51), np.float32)
-        while not stop.wait(0.05):
-            sensor.publish_message("status", status)
-            sensor.publish([contact], map=image, structure=image)
+        sensor.publish_message("status", status)
+        sensor.publish([contact], map=image, structure=image)
 
-    thread = threading.Thread(target=say)
     with bridged(sensor.address) as bridge, FoxgloveClient(bridge.url) as client:
         sensor.wait_for_subscriber()
-        thread.start()
-        try:
+        with repeated(say):
             tf = client.wait("/tf", lambda tf: tf.transforms[0].child_frame_id == "arm")
             scene = client.wait("/left/contacts", lambda scene: bool(scene.entities))
             surface = client.wait("/left/surface", lambda _: True)
             drawn = client.wait("/left/sheet", lambda _: True)
-        finally:
-            stop.set()
-            thread.join()
     (entity,) = scene.entities
     arrow, disc = entity.arrows[0].pose, entity.cylinders[0]
     assert entity.frame_id == "arm"

@@ -2,12 +2,32 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 PATIENCE_S = 60.0
 _T = TypeVar("_T")
+
+
+@contextmanager
+def repeated(say: Callable[[], object], step_s: float = 0.05) -> Iterator[None]:
+    """Call a function over and over meanwhile, in a thread of its own."""
+    stop = threading.Event()
+
+    def run() -> None:
+        while not stop.wait(step_s):
+            say()
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
 
 
 def wait_until(

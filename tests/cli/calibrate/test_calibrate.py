@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from tactomo_models import SkinSimulator, load_description
 from tactomo_models.calibration.calibration_file import calibration_path, read_calibration
 from tactomo_models.scene.press import Press
 from terminal import Terminal
+from waiting import repeated
 
 Run = Callable[..., Any]
 
@@ -259,26 +259,17 @@ class Pressed(FakeSensor):
         super().__init__("palm")
         self.magnitude = 0.0
         self.contacts = 1
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
 
-    def _run(self) -> None:
-        while not self._stop.wait(0.05):
-            contact = Contact(1, 3.0, -2.0, 700.0, self.magnitude, 0.003, None)
-            self.publish([contact] * self.contacts)
-            self.publish_message("status", STATUS)
-
-    def stop(self) -> None:
-        self._stop.set()
-        self._thread.join()
+    def say(self) -> None:
+        contact = Contact(1, 3.0, -2.0, 700.0, self.magnitude, 0.003, None)
+        self.publish([contact] * self.contacts)
+        self.publish_message("status", STATUS)
 
 
 @pytest.fixture
 def pressed() -> Iterator[Pressed]:
-    with Pressed() as sensor:
+    with Pressed() as sensor, repeated(sensor.say):
         yield sensor
-        sensor.stop()
 
 
 def take(terminal: Terminal, pressed: Pressed, number: int, kpa: float, magnitude: float) -> None:

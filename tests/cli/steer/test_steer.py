@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from threading import Timer
 from types import SimpleNamespace
@@ -20,7 +19,7 @@ from tactomo.running import Running, announced
 from tactomo.service.health_issues import FLAG_ADVICE, health_issues
 from tactomo_client.fake import FakeSensor
 from tactomo_models import Flag
-from waiting import PATIENCE_S, wait_until
+from waiting import PATIENCE_S, repeated, wait_until
 
 Run = Callable[..., Any]
 
@@ -226,19 +225,12 @@ def test_status_as_json_and_of_a_daemon_that_has_no_data_yet(tactomo: Run, contr
 
 @pytest.mark.slow
 def test_status_of_one_sensor_is_what_its_stream_tells(tactomo: Run) -> None:
-    stop = threading.Event()
-    with FakeSensor("left_forearm") as fake:
-
-        def publish() -> None:
-            while not stop.wait(0.05):
-                fake.publish_message("status", STATUS)
-
-        thread = threading.Thread(target=publish)
-        thread.start()
+    with (
+        FakeSensor("left_forearm") as fake,
+        repeated(lambda: fake.publish_message("status", STATUS)),
+    ):
         result = tactomo("status", "-s", "left_forearm", "--address", fake.address)
         other = tactomo("status", "-s", "right", "--address", fake.address)
-        stop.set()
-        thread.join()
     assert result.returncode == 0, result.stderr
     assert "left_forearm: running" in result.stdout
     assert other.returncode == 1

@@ -6,7 +6,6 @@ import dataclasses
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,7 +19,7 @@ from tactomo_client import Contact, subscribe
 from tactomo_client.appearance import PRESSED_COLOUR
 from tactomo_client.fake import FakeSensor
 from terminal import Terminal
-from waiting import PATIENCE_S
+from waiting import PATIENCE_S, repeated
 
 Run = Callable[..., Any]
 
@@ -49,19 +48,14 @@ def images() -> dict[str, Any]:
 @pytest.fixture
 def sensor() -> Iterator[FakeSensor]:
     """Publish a frame and a status twenty times a second."""
-    stop = threading.Event()
     with FakeSensor("skin") as fake:
 
         def publish() -> None:
-            while not stop.wait(0.05):
-                fake.publish([CONTACT], **images())
-                fake.publish_message("status", STATUS)
+            fake.publish([CONTACT], **images())
+            fake.publish_message("status", STATUS)
 
-        thread = threading.Thread(target=publish)
-        thread.start()
-        yield fake
-        stop.set()
-        thread.join()
+        with repeated(publish):
+            yield fake
 
 
 def in_a_terminal(*arguments: str, until: str) -> tuple[str, int]:
@@ -99,22 +93,18 @@ def test_the_end_of_a_replay_is_not_called_stale() -> None:
 @contextmanager
 def old_frames(fake: FakeSensor, status: dict[str, Any] = STATUS) -> Iterator[None]:
     """Publish, over and over, a status and then a frame of long ago."""
-    stop = threading.Event()
     old: dict[str, Any] = {"acquired_monotonic_ns": time.monotonic_ns() - 2_000_000_000}
+    missing = ["map", "status", "event"]  # or the frame might come without its status
 
     def publish() -> None:
-        for _ in ("map", "status", "event"):  # or the frame might come without its status
+        while missing:
             fake.wait_for_subscriber(PATIENCE_S)
-        while not stop.wait(0.05):
-            fake.publish_message("status", status)
-            fake.publish([], **images(), **old)
+            missing.pop()
+        fake.publish_message("status", status)
+        fake.publish([], **images(), **old)
 
-    thread = threading.Thread(target=publish)
-    thread.start()
-    with announced(Running("daemon", "", "left", fake.address)):
+    with repeated(publish), announced(Running("daemon", "", "left", fake.address)):
         yield
-    stop.set()
-    thread.join()
 
 
 def test_in_a_pipe_it_prints_a_line_a_frame(sensor: FakeSensor) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -28,7 +27,7 @@ from tactomo_models import load_description
 from tactomo_protocol import CompanionReading, Scan, ScanFlag
 from typer.testing import CliRunner
 from variants import variant
-from waiting import wait_until
+from waiting import repeated, wait_until
 
 SENSOR = load_description("matrix_disc")
 OWN = '''
@@ -95,20 +94,15 @@ def board() -> Iterator[str]:
     """A board that sends frames of noise around some voltages; yields its port's path."""
     device, host = os.openpty()
     os.set_blocking(device, False)
-    over = threading.Event()
     rng = np.random.default_rng(1)
 
     def send() -> None:
-        while not over.wait(0.02):
-            volts = rng.normal(1.0, 1e-4, SENSOR.measurements).astype("<f4")
-            with contextlib.suppress(BlockingIOError):  # nobody reads yet
-                os.write(device, b"EIT\n" + volts.tobytes())
+        volts = rng.normal(1.0, 1e-4, SENSOR.measurements).astype("<f4")
+        with contextlib.suppress(BlockingIOError):  # nobody reads yet
+            os.write(device, b"EIT\n" + volts.tobytes())
 
-    thread = threading.Thread(target=send)
-    thread.start()
-    yield os.ttyname(host)
-    over.set()
-    thread.join()
+    with repeated(send, 0.02):
+        yield os.ttyname(host)
     os.close(device)
     os.close(host)
 

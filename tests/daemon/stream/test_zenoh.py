@@ -9,7 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -31,7 +30,7 @@ from tactomo.stream.zenoh_publication import ENCODING, HEARTBEAT_S, STATUS_HEART
 from tactomo_client import Contact, request, subscribe
 from tactomo_client.fake import FakeSensor
 from tactomo_client.messages import decode_message, topic
-from waiting import PATIENCE_S, wait_until
+from waiting import PATIENCE_S, repeated, wait_until
 from whole_system import SENSOR, running_demo
 
 ZENOH = ("-m", "tactomo.cli", "zenoh", "--log-format", "json")
@@ -513,19 +512,10 @@ def test_the_pages_program_prints_touches_and_who_is_there(
     command = [sys.executable, "-I", "-u", str(script), str(client)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        stop = threading.Event()
-
-        def publish() -> None:
-            while not stop.wait(0.05):
-                left.publish(TOUCH)
-
-        publishing = threading.Thread(target=publish)
-        publishing.start()
         said: set[str] = set()
-        while len(said) < 2:  # it says a touch as often as it comes
-            said.add(process.stdout.readline().strip())
-        stop.set()
-        publishing.join()
+        with repeated(lambda: left.publish(TOUCH)):
+            while len(said) < 2:  # it says a touch as often as it comes
+                said.add(process.stdout.readline().strip())
         process.kill()
     bridge.end()
     assert said == {"tactomo/arm/left is there", "tactomo/arm/left/contacts 10, 0 mm"}
