@@ -25,7 +25,8 @@ MAX_BYTES: Final = 5_000_000
 MAX_PARTS: Final = 20_000
 """Lines, blocks and groups, as often as they are drawn: a kilobyte may draw one a billion times."""
 MAX_POINTS: Final = 200_000
-MAX_PATH_BYTES: Final = 100_000  # of SVG, whose reader is slow
+PART_BYTES: Final = 50  # of an SVG path are a part: its reader is slow
+CLOSED_PARTS: Final = 2  # parts of each closed line of an SVG path: its reader walks back for it
 MAX_LINES: Final = 5_000
 FLAT_MM: Final = 0.02  # curves become straight lines that are so near
 FLAT_SHARE: Final = 1e-6  # of a line's size, likewise: nobody's sheet is that large
@@ -60,10 +61,15 @@ def read_drawing(
         DataError: the file is damaged, names no unit, or has no closed outline.
         ImportError: ezdxf (DXF) or svgelements (SVG) is missing.
     """
+    layers_wanted = None if outline is None else {outline.lower(), electrodes.lower()}
+
+    def wanted(layers: tuple[str, ...]) -> bool:
+        return layers_wanted is None or not layers_wanted.isdisjoint(layers)
+
     read = _dxf if path.suffix.lower() == ".dxf" else _svg
     content = read_regular(path, MAX_BYTES)
     try:
-        lines = list(_bounded(read(content, unit_mm)))
+        lines = list(_bounded(read(content, unit_mm, wanted)))
     except (ImportError, DataError):
         raise
     except Exception as error:  # parsers raise almost anything
@@ -96,8 +102,8 @@ def _bounded(lines: Iterator[Line]) -> Iterator[Line]:
 
 def _too_much() -> DataError:
     return DataError(
-        f"the drawing has more than {MAX_PARTS} parts, {MAX_POINTS} points or {MAX_PATH_BYTES} "
-        "bytes of paths; save the sheet's outline and electrodes alone"
+        f"the drawing has more than {MAX_PARTS} parts or {MAX_POINTS} points; name the "
+        "outline's layer by --outline, or save the sheet's outline and electrodes alone"
     )
 
 
@@ -118,7 +124,9 @@ def _check_count(root: Any, below: Callable[[Any], Iterable[tuple[int, Any]]]) -
         raise _too_much()
 
 
-def _dxf(content: bytes, unit_mm: float | None) -> Iterator[Line]:
+def _dxf(
+    content: bytes, unit_mm: float | None, wanted: Callable[[tuple[str, ...]], bool]
+) -> Iterator[Line]:
     from ezdxf import disassemble, path, recover, units
     from ezdxf.enums import InsertUnits
 
@@ -143,6 +151,9 @@ def _dxf(content: bytes, unit_mm: float | None) -> Iterator[Line]:
         if entity.dxftype() in NO_LINE:
             continue
         layer = (str(entity.dxf.layer).lower(),)
+        if not wanted(layer):
+            yield Line(layer, np.zeros((0, 2)))
+            continue
         for part in disassemble.recursive_decompose([entity]):
             if part.dxftype() == "POINT":
                 yield Line(layer, unit_mm * np.array([part.dxf.location[:2]]))
@@ -158,7 +169,9 @@ def _dxf(content: bytes, unit_mm: float | None) -> Iterator[Line]:
                 yield Line(layer, unit_mm * points)
 
 
-def _svg(content: bytes, unit_mm: float | None) -> Iterator[Line]:
+def _svg(
+    content: bytes, unit_mm: float | None, wanted: Callable[[tuple[str, ...]], bool]
+) -> Iterator[Line]:
     import svgelements
 
     _check_svg(content)
@@ -176,9 +189,14 @@ def _svg(content: bytes, unit_mm: float | None) -> Iterator[Line]:
             inside = tuple({*layers, *(str(name).lower() for name in names if name)})
             if isinstance(element, svgelements.Group):
                 yield from walk(element, inside)
+            elif isinstance(element, svgelements.Shape) and not wanted(inside):
+                yield Line(inside, np.zeros((0, 2)))
             elif isinstance(element, svgelements.Shape):
                 for sub in svgelements.Path(element).as_subpaths():
-                    points = [_along(segment) for segment in svgelements.Path(sub)]
+                    segments = svgelements.Path(sub)
+                    if len(segments) > MAX_POINTS / POINTS:  # before its curves are drawn
+                        raise _too_much()
+                    points = [_along(segment) for segment in segments]
                     yield Line(inside, scale * np.concatenate([np.zeros((0, 2)), *points]))
 
     yield from walk(drawing, ())
@@ -187,17 +205,18 @@ def _svg(content: bytes, unit_mm: float | None) -> Iterator[Line]:
 def _check_svg(content: bytes) -> None:
     """Raise DataError where an SVG file draws too much, before anything of it is drawn."""
     held: dict[str, Element] = {}
+    stretch = Element("stretch")  # of a path
     elements: list[Element] = []
-    path_bytes = 0
     for _, element in iterparse(io.BytesIO(content), ("start",)):
         elements.append(element)
-        path_bytes += len(element.get("d", ""))
-        if len(elements) > MAX_PARTS or path_bytes > MAX_PATH_BYTES:
+        if len(elements) > MAX_PARTS:
             raise _too_much()
         held[f"#{element.get('id')}"] = element
 
     def below(part: Element) -> Iterator[tuple[int, Element]]:
         yield from ((1, each) for each in part)
+        path = part.get("d", "")
+        yield len(path) // PART_BYTES + CLOSED_PARTS * path.lower().count("z"), stretch
         used = held.get(part.get(HREF, part.get("href", "")))
         if part.tag.endswith("use") and used is not None:
             yield 1, used

@@ -147,6 +147,26 @@ def long_svg(path: Path) -> None:
     )
 
 
+def closed_svg(path: Path) -> None:
+    """A path that closes again and again, for which its reader looks back over all of it."""
+    path.write_text(
+        '<svg xmlns="http://www.w3.org/2000/svg" width="9mm" height="9mm"><path d="M0 0'
+        + "z" * 90_000
+        + '"/></svg>'
+    )
+
+
+def used_svg(path: Path) -> None:
+    """A long path, drawn many times."""
+    path.write_text(
+        '<svg xmlns="http://www.w3.org/2000/svg" width="9mm" height="9mm"><path id="0" d="M0 0'
+        + "h1" * 40_000
+        + '"/>'
+        + '<use href="#0"/>' * 5_000
+        + "</svg>"
+    )
+
+
 @pytest.mark.timeout(60)
 @pytest.mark.parametrize(
     ("name", "write"),
@@ -155,6 +175,8 @@ def long_svg(path: Path) -> None:
         ("grid.dxf", gridded_dxf),
         ("nested.svg", nested_svg),
         ("long.svg", long_svg),
+        ("closed.svg", closed_svg),
+        ("used.svg", used_svg),
     ],
 )
 def test_a_small_file_that_draws_without_end_is_refused(
@@ -169,3 +191,15 @@ def test_a_huge_circle_has_few_corners(tmp_path: Path) -> None:
     wide_dxf(tmp_path / "wide.dxf")
     model = read_drawing(tmp_path / "wide.dxf", "electrodes")
     assert len(model.polygon.exterior.coords) < 10_000
+
+
+def test_lettering_beside_the_layers_asked_for_costs_nothing(tmp_path: Path) -> None:
+    """300 kB of curves, as a drawing program makes of a title."""
+    letter = "".join(f"c{n}.125 1.250 2.375 3.500 4.625 5.750 " for n in range(20))
+    letters = "".join(f'<path d="M{n} 20 {letter}z"/>' for n in range(400))
+    (tmp_path / "titled.svg").write_text(
+        '<svg xmlns="http://www.w3.org/2000/svg" width="120mm" height="80mm" viewBox="0 0 120 80">'
+        f'<g id="sheet"><rect x="10" y="10" width="100" height="60"/></g><g>{letters}</g></svg>'
+    )
+    model = read_drawing(tmp_path / "titled.svg", "electrodes", "sheet")
+    assert model.polygon.area == pytest.approx(6000, rel=1e-5)
