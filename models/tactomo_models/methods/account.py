@@ -56,9 +56,9 @@ class Account:
 
     fitted: FittedField
     jacobian: FloatArray  # (sum M, N + 1) of its weighted residual
-    hessian: FloatArray  # (N + 1, N + 1) inverse covariance of its parameters and the log ratio
+    likelihood: Likelihood  # of that residual
+    prior: tuple[FloatArray, FloatArray]  # see `FieldFit.prior`
     chi_squared: float  # what it leaves of the data
-    log_evidence: float
     unit: float  # what one unit of its cost is of chi-squared
     at_minimum: bool = False
 
@@ -79,6 +79,22 @@ class Account:
         return hardly_pressed(self.family, self.fitted.parameters, self.jacobian)
 
     @cached_property
+    def _laplace(self) -> tuple[float, FloatArray]:
+        """Made where asked for: of most fields on the way to a minimum nobody asks."""
+        of = self.jacobian, self.chi_squared, *self.prior
+        return laplace(self.likelihood, self.family, self.fitted.parameters, *of)
+
+    @property
+    def log_evidence(self) -> float:
+        """Logarithm of its evidence, see `evidence`."""
+        return self._laplace[0]
+
+    @property
+    def hessian(self) -> FloatArray:
+        """(N + 1, N + 1) inverse covariance of its parameters and the log ratio."""
+        return self._laplace[1]
+
+    @cached_property
     def sigmas(self) -> FloatArray:
         """(K, COLUMNS) their standard uncertainties; 0 of what is not fitted."""
         sigmas = np.zeros(self.family.free.shape)
@@ -89,17 +105,12 @@ class Account:
 
 def account_of(fit: FieldFit, fitted: FittedField, frame: Frame) -> Account:
     """The account that a fitted field is of a frame."""
-    likelihood, family = frame.likelihood, fitted.family
-    assert isinstance(family, PressureField)
+    likelihood = frame.likelihood
     jacobian = fit.jacobian(fitted, frame.measured)
     chi_squared = likelihood.chi_squared(fitted.residual)
-    precision, offset = fit.prior(fitted)
-    log_evidence, hessian = laplace(
-        likelihood, family, fitted.parameters, jacobian, chi_squared, precision, offset
-    )
     valid = int(np.count_nonzero(likelihood.deflation))
     unit = likelihood.precision(chi_squared) * likelihood.count / max(valid, 1)
-    return Account(fitted, jacobian, hessian, chi_squared, log_evidence, unit)
+    return Account(fitted, jacobian, likelihood, fit.prior(fitted), chi_squared, unit)
 
 
 def laplace(

@@ -38,7 +38,7 @@ from tactomo_models.methods.rivals import (
 )
 from tactomo_models.scans.stillness import Since, are_still
 from tactomo_models.scene.field_account import Alternative
-from tactomo_models.scene.field_fit import COLD_S, FieldFit, Measured
+from tactomo_models.scene.field_fit import COLD_S, FieldFit, FittedField, Measured
 from tactomo_models.scene.parameters import COLUMNS, E1, E2, PEAK, SIZE, UNIT_M, X, Y
 from tactomo_models.scene.pressure import CLEARLY
 from tactomo_models.scene.pressure_field import PressureField
@@ -176,10 +176,10 @@ class Search:
         """The same contacts, fitted to a frame in which something has changed."""
         old = belief.account
         compared = self.fit.compare(old.fitted, frame.measured)
-        account = account_of(self.fit, compared, frame)
         ahead = self._moved_on(belief, frame)
-        if ahead is not None and ahead.fitted.cost < compared.cost:
-            account = ahead
+        if ahead is not None and ahead.cost < compared.cost:
+            compared = ahead
+        account = account_of(self.fit, compared, frame)
         frames = belief.frames + 1
         belief = replace(
             belief,
@@ -200,7 +200,7 @@ class Search:
         moved = (belief.account.contacts - old.contacts)[:, [X, Y]]
         return self._asking_again(replace(belief, moved=moved), due=due)
 
-    def _moved_on(self, belief: Belief, frame: Frame) -> Account | None:
+    def _moved_on(self, belief: Belief, frame: Frame) -> FittedField | None:
         """The contacts where they would be if they went on as they last moved."""
         account = belief.account
         if len(belief.moved) != len(account.contacts):
@@ -210,7 +210,7 @@ class Search:
             return None
         each = account.contacts.copy()
         each[:, [X, Y]] += belief.moved
-        return self._account(each, account.fitted.log_ratio, frame)
+        return self._fitted(each, account.fitted.log_ratio, frame)
 
     def _asking_again(self, belief: Belief, *, due: bool) -> Belief:
         """Ask a contact that is pressed quite differently; where it is due, what is open, too."""
@@ -342,15 +342,15 @@ class Search:
         """The contacts that explain most: one after the other is left out while that helps."""
         while account.family.count > 0:
             rests = [
-                self._account(
+                self._fitted(
                     np.delete(account.contacts, k, axis=0), account.fitted.log_ratio, frame
                 )
                 for k in range(account.family.count)
             ]
-            best = min(rests, key=lambda one: one.fitted.cost)
-            if best.fitted.cost >= account.fitted.cost:
+            best = min(rests, key=lambda one: one.cost)
+            if best.cost >= account.fitted.cost:
                 break
-            account = best
+            account = account_of(self.fit, best, frame)
         return account
 
     def _begun(self, account: Account, frame: Frame, how: str) -> Belief:
@@ -643,13 +643,16 @@ class Search:
         """Steps of a fit of something else: unexplained, it may have far to go."""
         return 2 * STEPS if frame.likelihood.explains(account.chi_squared) else FAR_STEPS
 
-    def _account(self, each: FloatArray, log_ratio: float, frame: Frame) -> Account:
+    def _fitted(self, each: FloatArray, log_ratio: float, frame: Frame) -> FittedField:
         family = self.field.of(each, fits_peaks=frame.fits_peaks)
         fitted = self.fit.evaluate(
             family, family.bounded(family.join(each)), log_ratio, frame.measured
         )
         frame.budget.spend(fitted)
-        return account_of(self.fit, fitted, frame)
+        return fitted
+
+    def _account(self, each: FloatArray, log_ratio: float, frame: Frame) -> Account:
+        return account_of(self.fit, self._fitted(each, log_ratio, frame), frame)
 
     def _descended(
         self, account: Account, frame: Frame, steps: int, *, holds_ratio: bool = False
