@@ -214,7 +214,8 @@ def field(
     unless stated. *rectangles-rings*: these shapes alone. *hand-made*: electrodes displaced by 1
     mm, contact impedances by 30 %, sheets uneven by 10 %. *soft*: balls of 180 to 300 kPa, at 60 dB
     of the voltages. *graded*: one sheet alone, without an onset. *crowded*: five or six small
-    contacts. *many*: eight to ten contacts. *mixed*: flat ellipses, rectangles, rings and balls
+    contacts. *many*: eight to ten contacts. *crowded-soft*, *crowded-mixed*: five or six small
+    balls, and flat ones among them. *mixed*: flat ellipses, rectangles, rings and balls
     side by side, on hand-made skins, at 60 dB of the voltages. *moving*: a sequence for every ten
     scenes, at 20 frames a second: contacts slide, land, lift, jump, merge and split, with lost
     scans, whose frames are left out, and a tare. *mixed-moving*: such a sequence of mixed presses

@@ -41,6 +41,8 @@ REGIME_ROWS: Final = (
     "graded",
     "crowded",
     "many",
+    "crowded-soft",
+    "crowded-mixed",
     "mixed",
     "overload",
 )

@@ -303,8 +303,25 @@ def _many(draw: Draw) -> Plan:
     return _small_ones(draw, 8 + draw.number % 3)
 
 
-def _small_ones(draw: Draw, count: int) -> Plan:
-    return draw.plan(draw.apart(count, lambda: draw.press((6, 10)), gap_mm=6))
+@regime("crowded-soft", "Five or six small balls.")
+def _crowded_soft(draw: Draw) -> Plan:
+    return _small_ones(draw, 5 + draw.number % 2, balls=1.0)
+
+
+@regime("crowded-mixed", "Five or six small contacts, flat ones and balls.")
+def _crowded_mixed(draw: Draw) -> Plan:
+    return _small_ones(draw, 5 + draw.number % 2, balls=0.5)
+
+
+def _small_ones(draw: Draw, count: int, balls: float = 0.0) -> Plan:
+    """So many, of which such a share are balls."""
+
+    def small() -> Press:
+        if balls == 1 or (balls and draw.rng.random() < balls):
+            return draw.press((6, 10), pressure_kpa=SOFT_KPA, profile="dome")
+        return draw.press((6, 10))
+
+    return draw.plan(draw.apart(count, small, gap_mm=6))
 
 
 @regime("small-by-large", "A small contact beside a large one.")

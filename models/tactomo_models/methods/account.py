@@ -11,7 +11,7 @@ import numpy as np
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import BoolArray, FloatArray
-from tactomo_models.methods.kinds import log_prior
+from tactomo_models.methods.kinds import kind_of, log_prior
 from tactomo_models.scene.evidence import Likelihood, log_occam
 from tactomo_models.scene.field_fit import (
     MAX_DAMPING,
@@ -127,7 +127,8 @@ def laplace(
     hessian = likelihood.information(told, chi_squared)
     hessian[np.diag_indices(len(hessian))] += precision
     log_evidence = likelihood.log(chi_squared) - float(precision @ offset**2) / 2
-    log_evidence += log_occam(precision, hessian) + log_prior(family.split(parameters))
+    log_evidence += log_occam(precision, hessian)
+    log_evidence += log_prior(map(kind_of, family.split(parameters)))
     log_evidence += math.lgamma(family.count + 1)  # log K!
     return log_evidence, hessian
 

@@ -7,6 +7,9 @@ these are asked as the kinds are.
 
 from __future__ import annotations
 
+import math
+from collections import Counter
+from collections.abc import Iterable
 from enum import StrEnum, auto
 
 import numpy as np
@@ -52,9 +55,25 @@ class Kind(StrEnum):
 SHARES = {Kind.EVEN: 0.35, Kind.FALLING: 0.3, Kind.ROUNDED: 0.2, Kind.RING: 0.15}
 
 
-def log_prior(contacts: FloatArray) -> float:
-    """Logarithm of how likely the kinds of contacts (K, COLUMNS) are before any data."""
-    return float(sum(np.log(SHARES[kind_of(contact)]) for contact in contacts))
+# Of all kinds together, how many contacts would tell as much of what presses as these shares do: as
+# many as there are kinds. With half, peaks of tuning rows are right in: mixed 74 % (78 %), soft on
+# hand-made skins 69 % (72 %), crowds 95 % (93 %) and 92 % (92 %); with twice 77, 74, 86 and 83 %;
+# with each contact for itself 79, 68, 64 and 57 %.
+TOLD = len(SHARES)
+
+
+def log_prior(kinds: Iterable[Kind]) -> float:
+    """Logarithm of how likely the kinds of a scene's contacts are before any data.
+
+    What presses a skin often presses it alike: the kinds are drawn by shares that are the scene's
+    own, and these by Dirichlet's distribution around `SHARES` (Polya's urn; Gelman et al.,
+    "Bayesian Data Analysis", 2013, section 3.4).
+    """
+    counts = Counter(kinds)
+    found = math.lgamma(TOLD) - math.lgamma(TOLD + counts.total())
+    for kind, count in counts.items():
+        found += math.lgamma(TOLD * SHARES[kind] + count) - math.lgamma(TOLD * SHARES[kind])
+    return found
 
 
 def kind_of(contact: FloatArray) -> Kind:

@@ -96,21 +96,13 @@ class Belief:
         account, family = self.account, self.account.family
         above = account.contacts[:, PEAK] > family.onset
         may_differ = above & family.free[:, PEAK]
-        return [
-            [
-                Alternative(
-                    float(np.exp(min(rival.log_odds, 700))),
-                    contact + rival.difference,
-                    rival.sigmas,
-                )
-                for rival in mine.values()
-                if rival.is_one
-            ]
-            + (unasked(contact, sigmas, mine) if is_open else [])
-            for contact, sigmas, mine, is_open in zip(
-                account.contacts, account.sigmas, self.rivals, may_differ, strict=True
-            )
-        ]
+        every: list[list[Alternative]] = []
+        for k, (contact, mine) in enumerate(zip(account.contacts, self.rivals, strict=True)):
+            others = [rival.of(contact) for rival in mine.values() if rival.is_one]
+            if may_differ[k]:
+                others += unasked(k, account.contacts, account.sigmas[k], mine)
+            every.append(others)
+        return every
 
 
 class Search:
@@ -444,7 +436,9 @@ class Search:
         found = predict(self.fit, self.field, account, asks, frame)
         for (k, kind), each in zip(asks, found, strict=True):
             before, log_odds = rivals[k].get(kind), each.log_evidence - now
-            rivals[k][kind] = as_predicted(each, log_odds, account.contacts[k], before)
+            rivals[k][kind] = as_predicted(
+                each, log_odds, account.contacts[k], before, account.unit
+            )
         for _ in {k for k, _ in asks}:
             frame.budget.spend(account.fitted)  # about what asking a contact takes
         return replace(belief, rivals=tuple(rivals))

@@ -14,6 +14,7 @@ from tactomo_lab.evaluation.field import (
     scores_of_row,
 )
 from tactomo_lab.evaluation.moving import NOISE_DB, draw_sequence, mixed_sequence
+from tactomo_lab.evaluation.play import play
 from tactomo_lab.evaluation.regimes import make_case
 from tactomo_lab.scenes.case import Case
 from tactomo_lab.scenes.measures import summarise
@@ -39,6 +40,14 @@ def test_a_scene_of_each_row_is_reconstructed_and_scored(
         assert len(score.contacts) == len(scenes[line].frames[0].presses)
         assert -1 <= score.icc <= 1
         assert score.seconds > 0
+
+
+@pytest.mark.slow
+def test_a_small_ball_in_a_crowd_is_not_surely_flat(paper: SensorDescription) -> None:
+    """What was predicted from afar is solved for: here a ball was flat with odds of 10^7 to 1."""
+    (outcome,) = play([make_case(paper, "crowded-soft", "tuning", 3)], "auto")
+    assert outcome.score.count_right
+    assert not any(contact.surely_wrong for contact in outcome.score.contacts)
 
 
 @pytest.mark.slow

@@ -66,6 +66,10 @@ def test_regimes_are_what_they_are_called(paper: SensorDescription) -> None:
         assert 0.007 <= press.radius_y_m <= press.radius_m <= 0.020
     for plan in plans(paper, "many"):
         assert all(gap_m(a, b) > 0.005 for a, b in combinations(plan.frames[0], 2))
+    for name, profiles in (("crowded-soft", {"dome"}), ("crowded-mixed", {"flat", "dome"})):
+        crowds = [plan.frames[0] for plan in plans(paper, name)]
+        assert {len(presses) for presses in crowds} == {5, 6}
+        assert {press.profile for presses in crowds for press in presses} == profiles
     for plan in plans(paper, "edges"):
         for press in plan.frames[0]:
             assert 0.0669 < np.abs(outline_of(press)).max() < 0.0691

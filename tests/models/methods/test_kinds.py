@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
+from itertools import product
+from random import Random
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pressed import contact, contacts
 from tactomo_models.arrays import FloatArray
-from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
+from tactomo_models.methods.kinds import SHARES, Kind, as_kind, as_one, kind_of, log_prior
 from tactomo_models.scene.parameters import COLUMNS, E1, E2, PEAK, SIZE, UNIT_M, X, Y
 
 ONE = [Kind.EVEN, Kind.ROUNDED, Kind.RING, Kind.FALLING]
@@ -75,6 +79,28 @@ def test_halves_keep_area_and_centre(
     if elongation > 1e-6:
         along = np.array([np.cos(angle / 2), np.sin(angle / 2)])
         assert abs(along @ away) == pytest.approx(np.linalg.norm(away))
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_kinds_of_a_scene_are_as_likely_altogether_as_one(count: int) -> None:
+    """And a contact alone as its share, whatever else there may be."""
+    likely = {kinds: math.exp(log_prior(kinds)) for kinds in product(ONE, repeat=count)}
+    assert sum(likely.values()) == pytest.approx(1)
+    for kind in ONE:
+        first = sum(each for kinds, each in likely.items() if kinds[0] is kind)
+        assert first == pytest.approx(SHARES[kind])
+
+
+@given(st.lists(st.sampled_from(ONE), min_size=2, max_size=12), st.randoms())
+def test_contacts_of_a_scene_are_more_often_alike(kinds: list[Kind], random: Random) -> None:
+    """In any order."""
+    alone = sum(log_prior([kind]) for kind in kinds)
+    if len(set(kinds)) == 1:
+        assert log_prior(kinds) > alone
+    if len(set(kinds)) == len(kinds):
+        assert log_prior(kinds) < alone
+    again = random.sample(kinds, len(kinds))
+    assert log_prior(again) == pytest.approx(log_prior(kinds))
 
 
 def test_nothing_is_no_contact() -> None:
