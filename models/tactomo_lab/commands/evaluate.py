@@ -233,7 +233,7 @@ def field(
     the voltages in the cache. Rows that the sensor cannot have, such as *overload* without a
     magnitude channel, are left out.
     """
-    from tactomo_models import ModelError, load_description
+    from tactomo_models import ArtifactError, MethodError, load_description
 
     from tactomo_lab.commands.pictures import draw_overview, draw_press
     from tactomo_lab.evaluation.field import ROWS, STILL_ROWS, middle_press, scores_of_row
@@ -255,7 +255,10 @@ def field(
         for line, frames in lines_of.items():
             try:
                 by_line.setdefault(line, {})[one] = list(shown(frames, total, line))
-            except ModelError as error:  # of a row's own sensor, for which a method may not serve
+            except (
+                ArtifactError,
+                MethodError,
+            ) as error:  # of a row's own sensor, for which a method may not serve
                 say(f"left out: {line}: {error}", err=True)
     scores = {
         line if len(methods) == 1 else f"{line}, {one}": own

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from tactomo_models.batch import BUDGET_S
 from tactomo_models.drift.baseline import BaselineTracker
-from tactomo_models.errors import MethodError
+from tactomo_models.errors import ModelError
 from tactomo_models.physics.artifact import load_or_build_artifact
 from tactomo_models.reconstruct import Reconstructor
 from tactomo_models.scans.reference import Reference
@@ -106,7 +106,7 @@ class Player:
                     made = self.tracker.reconstruct(frame.time_s, *scans)
                 seconds = time.thread_time() - begin_s
             if made.failure:  # the frame is another method's
-                raise MethodError(made.failure)
+                raise ModelError(made.failure)
             yield Played(variant, case, frame, made, seconds)
 
     def _take(self, tare: Reference) -> None:

@@ -55,3 +55,19 @@ def test_what_it_does_not_know_is_a_usage_error(
     result = field(option, value)
     assert result.returncode == 2
     assert why in result.stderr
+
+
+@pytest.mark.slow
+def test_an_own_method_that_fails_ends_it(
+    field: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is not left out, as a method that does not serve the sensor is."""
+    (tmp_path / "divides_by_zero.py").write_text(
+        "class Method:\n"
+        "    def prepare(self, skin): pass\n"
+        "    def solve(self, measurement, previous, budget_s): return 1 / 0\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    result = field("--rows", "ordinary", "--count", 1, "--method", "divides_by_zero:Method")
+    assert result.returncode == 1
+    assert "division by zero" in result.stderr
