@@ -48,7 +48,7 @@ class _SimulatedCompanion:
         companion = self._companion
         noise = np.random.default_rng([self._seed, self._index, counter, 3]).standard_normal()
         felt_n = self._gain * self._behind(force_n, time_s) + companion.noise_n * float(noise)
-        value = companion.offset + felt_n / companion.gain_n_per_unit
+        value = companion.reading_of(felt_n)
         flags = ScanFlag.SIMULATED
         if not companion.may_read(value):
             flags |= ScanFlag.SATURATED

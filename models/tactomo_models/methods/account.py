@@ -108,9 +108,14 @@ def account_of(fit: FieldFit, fitted: FittedField, frame: Frame) -> Account:
     likelihood = frame.likelihood
     jacobian = fit.jacobian(fitted, frame.measured)
     chi_squared = likelihood.chi_squared(fitted.residual)
-    valid = int(np.count_nonzero(likelihood.deflation))
-    unit = likelihood.precision(chi_squared) * likelihood.count / max(valid, 1)
+    unit = unit_of(likelihood, chi_squared)
     return Account(fitted, jacobian, likelihood, fit.prior(fitted), chi_squared, unit)
+
+
+def unit_of(likelihood: Likelihood, chi_squared: float) -> float:
+    """What one unit of cost is of chi-squared, where so much of that is left."""
+    valid = int(np.count_nonzero(likelihood.deflation))
+    return likelihood.precision(chi_squared) * likelihood.count / max(valid, 1)
 
 
 def laplace(

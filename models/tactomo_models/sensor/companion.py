@@ -45,6 +45,10 @@ class Companion(Section):
             )
         return self
 
+    def reading_of(self, force_n: float) -> float:
+        """The reading at a force."""
+        return self.offset + force_n / self.gain_n_per_unit
+
     def may_read(self, reading: float) -> bool:
         """Whether a reading is a number within the limits."""
         least, most = self.limits or (-np.inf, np.inf)

@@ -71,8 +71,12 @@ class SkinSimulator:
     def forces_n(self, presses: Sequence[Press]) -> dict[str, float]:
         """The force in newtons that each companion of the sensor feels."""
         pressure, coverage = strongest(presses, self._x, self._y, self.spacing_m)
+        return self.forces_under(pressure, coverage)
+
+    def forces_under(self, pressure_kpa: FloatArray, coverage: FloatArray) -> dict[str, float]:
+        """The same for any pressure at the nodes, as `voltages_under` has it."""
         return {
-            name: float(self.forward.newtons_per_kpa(one.region_m) @ (pressure * coverage))
+            name: float(self.forward.newtons_per_kpa(one.region_m) @ (pressure_kpa * coverage))
             for name, one in self.description.companion.items()
         }
 

@@ -9,7 +9,8 @@ pressed is cut off and counted; a contact that is off the sheet or behind it is 
 nothing. Shear is not felt: a sheet's conductivity answers to pressure.
 
 The pressure makes both sheets' voltages on another mesh than the one that reconstructs, with an
-uneven sheet and noise. Source: K. L. Johnson, Contact Mechanics (1985), section 4.2.
+uneven sheet and noise; companions feel the force at once, with their noise. Source: K. L. Johnson,
+Contact Mechanics (1985), section 4.2.
 """
 
 from __future__ import annotations
@@ -166,7 +167,9 @@ class MujocoSkin:
         volts = self._simulator.voltages_under(under, coverage) if presses else self._bare
         scan = self._noisy(volts)
         frame = self._reconstructor.reconstruct(
-            scan.get(Channel.MAGNITUDE), scan.get(Channel.STRUCTURE)
+            scan.get(Channel.MAGNITUDE),
+            scan.get(Channel.STRUCTURE),
+            companions=self._readings(self._simulator.forces_under(under, coverage)),
         )
         truth_kpa = self.description.shown(self._nodes.on_map(pressure))
         return Touch(frame, truth_kpa, force_n, lost_n, outside)
@@ -176,6 +179,14 @@ class MujocoSkin:
         return {
             name: v + noise_v[name] * self._rng.standard_normal(len(v)) for name, v in volts.items()
         }
+
+    def _readings(self, forces_n: dict[str, float]) -> list[tuple[str, float]]:
+        """What companions read, each in its own unit."""
+        known = self.description.companion
+        return [
+            (name, known[name].reading_of(self._rng.normal(force_n, known[name].noise_n)))
+            for name, force_n in forces_n.items()
+        ]
 
     def _presses(self, data: Any) -> tuple[list[tuple[Press, float]], float, tuple[Outside, ...]]:
         """Return what presses and its force, the force over the border, and what is outside."""

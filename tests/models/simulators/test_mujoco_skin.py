@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from page import Page
 from tactomo_models import DataError, load_description
+from tactomo_models.sensor.companion import Companion
 from tactomo_models.simulators.gymnasium_skin import TactileObservation
 from tactomo_models.simulators.mujoco_skin import MujocoSkin, Touch
 from variants import variant
@@ -230,3 +231,17 @@ def test_a_sheet_around_a_capsule_feels_where_a_ball_presses() -> None:
     assert contact.frame == "arm"
     assert contact.position_m == pytest.approx(0.05 * out + [0, 0, 0.02], abs=2e-3)
     assert contact.normal == pytest.approx(out, abs=0.05)
+
+
+@pytest.mark.slow
+def test_companions_feel_the_force_too() -> None:
+    """A load cell of another unit, in the fit of every frame."""
+    sensor = load_description("graded_square")
+    cell = Companion(gain_n_per_unit=2.0, offset=7.0, noise_n=0.05)
+    sensor = sensor.model_copy(update={"companion": {"cell": cell}})
+    model, data = settled(body("ball", BALL, 20, -15, 60))
+    touch = MujocoSkin(model, "skin", sensor).feel(data)
+    told = touch.frame.companions["cell"]
+    assert told.state == "fitted"
+    assert told.force_n == pytest.approx(touch.force_n, abs=0.3)
+    assert sum(one.force_n for one in touch.frame.contacts) == pytest.approx(60, rel=0.05)
