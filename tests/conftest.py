@@ -53,6 +53,7 @@ settings.load_profile("few")
 
 # A shell that starts this in the background ignores Ctrl-C, and so would the programs under test.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # likewise under `nohup`, which programs respect
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

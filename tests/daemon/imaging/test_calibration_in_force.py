@@ -287,14 +287,15 @@ def test_files_that_were_cut_replay_by_the_calibration_of_each(
     pressed.bench.ask("record_stop")
     kept(factor=3.0)
     live = pressed.live
-    again = pressures(replay(folder).of("contacts"))
-    assert {counter: kpa for counter, kpa in again.items() if counter in live} == live
     parts = sorted(folder.iterdir())
     assert len(parts) >= 4
+    heard = 0
     for part in map(open_recording, parts):
         if part.summary.frames and part.origin.calibration:  # none: begun just before the end
             alone = pressures(replay(part.path).of("contacts"))
             assert alone == {counter: live.get(counter, []) for counter in alone}
+            heard += 1
+    assert heard >= 3
 
 
 @pytest.mark.slow

@@ -43,6 +43,9 @@ class Frames:
     def share_processor(self, dropped: int) -> None:
         pass
 
+    def tell_status(self) -> None:
+        pass
+
 
 def started(frames: Any, *, lossless: bool = False, replay: Replay | None = None) -> Pipeline:
     ports = 1 if replay is None else 2

@@ -124,7 +124,7 @@ def test_the_daemon_reads_a_board_by_a_protocol_that_is_named(folder: Path, boar
         assert (port["protocol"], port["device"]["device_id"]) == ("floats", "floats")
         daemon.ask("record_start", path=path.name)
         frames = daemon.status()["frames"]
-        wait_until(lambda: daemon.status()["frames"] > frames + 5, "frames")
+        wait_until(lambda: daemon.status()["frames"] > frames + 10, "frames")
         daemon.ask("record_stop")
         for module in ("own_board:Floats", "own_board:Broken"):
             with pytest.raises(ControlError):

@@ -161,10 +161,11 @@ def test_where_frames_lag_the_state_is_late_and_not_that_no_scans_come(
     bench: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(status, "STALE_S", 0.2)
-    b = bench(seconds=1.5, tare_scans=2)
-    b.skin.introduce()
-    for _ in range(3):
-        b.skin.scan()
+    b = bench()
+    b.tare()
+    for _ in range(5):
+        b.step()
+    b.daemon._imaging._reconstructor.seconds = 1.5  # far above the frames' pace until now
 
     def state() -> str:
         b.skin.scan()
