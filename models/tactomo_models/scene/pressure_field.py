@@ -219,9 +219,8 @@ class PressureField:
         each[:, E1:HARMONIC] *= np.minimum(1, max_elongated / elongation)[:, None]
         _limit(each[:, HARMONIC:PEAK], -MAX_BULGE, MAX_BULGE)
         _limit(each[:, PEAK], *self.peak_limits)
-        flat = each[:, EDGE] <= 0
-        _limit(each[:, EDGE], *EDGE_LIMITS)
-        each[flat, EDGE] = 0.0
+        falls = self.fixed[:, EDGE] > 0  # and stays so: what is even is another kind
+        each[falls, EDGE] = np.clip(each[falls, EDGE], *EDGE_LIMITS)
         return self.join(each)
 
     def draw(self, parameters: FloatArray) -> Drawing:

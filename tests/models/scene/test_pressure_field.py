@@ -18,6 +18,7 @@ from tactomo_models.scene.level_set import LevelSet
 from tactomo_models.scene.parameters import (
     COLUMNS,
     EDGE,
+    EDGE_LIMITS,
     HARMONIC,
     HOLE,
     PEAK,
@@ -235,6 +236,15 @@ def test_contacts_stay_on_the_sheet_and_of_a_contacts_size(
     drawing = family.draw(bounded)
     assert np.isfinite(drawing.share).all()
     assert np.isfinite(drawing.pressure_kpa).all()
+
+
+def test_a_step_makes_no_other_kind_of_a_contact(field: PressureField) -> None:
+    """What falls goes on to fall, however far a step leads; what is even stays even."""
+    each = contacts(contact(-0.03, edge=0.5), contact(0.03))
+    family = field.of(each)
+    each[0, EDGE] = -0.2
+    inside = family.split(family.bounded(family.join(each)))
+    np.testing.assert_array_equal(inside[:, EDGE], [EDGE_LIMITS[0], 0.0])
 
 
 @given(
