@@ -139,11 +139,13 @@ def reconstruct_file(
                 taken = {name: _scan(scans, name, index) for name in Channel}
                 for name, scan in taken.items():
                     found = None if scan is None else repeats.find(name, scan, reference)
-                    if found is not None and not found.parts and found.voltages.all():
-                        taken[name], repeated = None, repeated + 1
+                    if scan is not None and found is not None:
+                        taken[name] = found.without(scan)
+                        repeated += taken[name] is None
                 start = time.perf_counter()
                 companions = [(name, float(each[index])) for name, each in readings.items()]
-                frame = reconstructor.reconstruct(*taken.values(), companions=companions)
+                compared = reconstructor.compare(*taken.values(), companions=companions)
+                frame = reconstructor.solve(compared)
                 arrays.append({"seconds": time.perf_counter() - start, **_frame_row(frame)})
                 for contact in frame.contacts:
                     arrays.append(_contact_row(index, contact))

@@ -6,7 +6,6 @@ told from a source without noise.
 
 from __future__ import annotations
 
-import numpy as np
 from tactomo_models import Reference
 from tactomo_models.scans.repeats import Repeats
 from tactomo_models.sensor.pattern import Pairs
@@ -49,6 +48,6 @@ class FrozenConverters:
                 )
             else:
                 self._on_event("converter_back", f"{channel} scans are measured again", "", channel)
-            if not repeated.all():
-                measured[channel] = np.where(repeated, np.nan, scan)
+            if (left := found.without(scan)) is not None:
+                measured[channel] = left
         return measured

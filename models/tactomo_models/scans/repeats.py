@@ -32,6 +32,10 @@ class Repeated(NamedTuple):
     parts: tuple[str, ...]  # in words: drives and measuring pairs; none where all is repeated
     voltages: BoolArray  # (M,)
 
+    def without(self, scan: FloatArray) -> FloatArray | None:
+        """What was measured of the scan (M,), NaN elsewhere; None where all is repeated."""
+        return None if self.voltages.all() else np.where(self.voltages, np.nan, scan)
+
 
 class Repeats:
     """Finds what scans of one sensor's pattern repeat, one after another."""
@@ -63,7 +67,7 @@ class Repeats:
         noise: Any = getattr(reference, f"{channel}_noise", None)
         if not len(earlier) or not _is_noisy(reference, noise, scan):
             return None
-        told = np.isfinite(scan) & (noise > 0)
+        told = np.isfinite(scan) & np.isfinite(noise) & (noise > 0)
         with np.errstate(over="ignore"):
             changes = (scan[told] - earlier[:, told]) / noise[told]
             squares = np.einsum("nm,nm->n", changes, changes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -49,3 +50,18 @@ def test_a_live_scan_does_not_repeat_though_its_noise_has_fallen(
     paper: SensorDescription, noise: float
 ) -> None:
     assert share_that_repeats(paper, lambda *_: live(noise)) == 0
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_voltage_without_bounds_says_nothing(paper: SensorDescription) -> None:
+    at_rest = np.array([live() for _ in range(20)])
+    known = Reference.from_scans(at_rest, None)
+    assert known.magnitude_noise is not None
+    noise = np.where(np.arange(208) == 3, np.inf, known.magnitude_noise)
+    reference, repeats = replace(known, magnitude_noise=noise), Repeats(paper.pairs)
+    last = live()
+    last[3] = np.inf
+    repeats.find(Channel.MAGNITUDE, last, reference)
+    found = repeats.find(Channel.MAGNITUDE, live(), reference)
+    assert found is not None
+    assert not found.voltages.any()
