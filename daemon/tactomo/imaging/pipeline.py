@@ -238,7 +238,7 @@ class Pipeline(Worker):
         assert self._replay is not None
         playback = self._replay.playback
         playback.maps_before = self._imaging.maps_published
-        playback.move(position_s)
+        moved = playback.move(position_s)
         self._replay_clock = ReplayClock(self._ports, self._replay.is_paced)
         self.finished.clear()
         before, self.sync = self.sync, self._new_sync()
@@ -249,7 +249,7 @@ class Pipeline(Worker):
         self.sync.carry_on(before)
         self.skew = Skew()
         self._imaging.forget()
-        return playback.fields()
+        return moved
 
     def _obey_commands(self) -> None:
         while not self._commands.empty():

@@ -124,8 +124,11 @@ class Playback:
                 self._is_stepping = False
             return may
 
-    def move(self, position_s: float) -> None:
-        """Go on `position_s` seconds after the beginning; while paused, by one dual scan."""
+    def move(self, position_s: float) -> dict[str, Any]:
+        """Go on `position_s` seconds after the beginning; while paused, by one dual scan.
+
+        Returns the fields as they are before anything goes on.
+        """
         with self._changed:
             position_ns = self.start_ns + round(position_s * 1e9)
             self.begin_ns = self._position_ns = min(position_ns, self._last_ns)
@@ -133,6 +136,7 @@ class Playback:
             self._is_stepping = self._is_paused
             self.passes += 1
             self._changed.notify_all()
+            return self.fields()
 
     @property
     def _pace(self) -> float:

@@ -279,7 +279,7 @@ def test_the_reply_to_a_move_tells_which_maps_are_of_before(play: Any, life: Lif
     b = play(life.path)
     for position_s in (life.times_s[list(life.values)[5]], 0.0):
         moved = b.ask("replay", position_s=position_s)
-        assert moved["position_s"] == pytest.approx(position_s, abs=0.1)  # it goes on at once
+        assert moved["position_s"] == pytest.approx(position_s)
         frame = b.listener.wait("map", lambda f, n=moved["maps_before"]: f["sequence"] > n)
         assert frame["sequence"] == moved["maps_before"] + 1
         shown = life.times_s[frame["scan_counter"]]
