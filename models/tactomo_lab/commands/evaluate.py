@@ -255,10 +255,8 @@ def field(
         for line, frames in lines_of.items():
             try:
                 by_line.setdefault(line, {})[one] = list(shown(frames, total, line))
-            except (
-                ArtifactError,
-                MethodError,
-            ) as error:  # of a row's own sensor, for which a method may not serve
+            except (ArtifactError, MethodError) as error:
+                # Of a row's own sensor, for which a method may not serve.
                 say(f"left out: {line}: {error}", err=True)
     scores = {
         line if len(methods) == 1 else f"{line}, {one}": own

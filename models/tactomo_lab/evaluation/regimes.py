@@ -305,19 +305,17 @@ def _many(draw: Draw) -> Plan:
 
 @regime("crowded-soft", "Five or six small balls.")
 def _crowded_soft(draw: Draw) -> Plan:
-    return _small_ones(draw, 5 + draw.number % 2, balls=1.0)
+    return _small_ones(draw, 5 + draw.number % 2, lambda: True)
 
 
 @regime("crowded-mixed", "Five or six small contacts, flat ones and balls.")
 def _crowded_mixed(draw: Draw) -> Plan:
-    return _small_ones(draw, 5 + draw.number % 2, balls=0.5)
+    return _small_ones(draw, 5 + draw.number % 2, lambda: draw.rng.random() < 0.5)
 
 
-def _small_ones(draw: Draw, count: int, balls: float = 0.0) -> Plan:
-    """So many, of which such a share are balls."""
-
+def _small_ones(draw: Draw, count: int, is_ball: Callable[[], bool] = lambda: False) -> Plan:
     def small() -> Press:
-        if balls == 1 or (balls and draw.rng.random() < balls):
+        if is_ball():
             return draw.press((6, 10), pressure_kpa=SOFT_KPA, profile="dome")
         return draw.press((6, 10))
 

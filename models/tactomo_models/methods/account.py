@@ -59,7 +59,6 @@ class Account:
     likelihood: Likelihood  # of that residual
     prior: tuple[FloatArray, FloatArray]  # see `FieldFit.prior`
     chi_squared: float  # what it leaves of the data
-    unit: float  # what one unit of its cost is of chi-squared
     at_minimum: bool = False
 
     @property
@@ -77,6 +76,11 @@ class Account:
     def is_hardly_pressed(self) -> BoolArray:
         """Which contacts (K,) the graded sheet does not tell to press."""
         return hardly_pressed(self.family, self.fitted.parameters, self.jacobian)
+
+    @cached_property
+    def unit(self) -> float:
+        """What one unit of its cost is of chi-squared."""
+        return self.likelihood.unit(self.chi_squared)
 
     @cached_property
     def _laplace(self) -> tuple[float, FloatArray]:
@@ -108,14 +112,7 @@ def account_of(fit: FieldFit, fitted: FittedField, frame: Frame) -> Account:
     likelihood = frame.likelihood
     jacobian = fit.jacobian(fitted, frame.measured)
     chi_squared = likelihood.chi_squared(fitted.residual)
-    unit = unit_of(likelihood, chi_squared)
-    return Account(fitted, jacobian, likelihood, fit.prior(fitted), chi_squared, unit)
-
-
-def unit_of(likelihood: Likelihood, chi_squared: float) -> float:
-    """What one unit of cost is of chi-squared, where so much of that is left."""
-    valid = int(np.count_nonzero(likelihood.deflation))
-    return likelihood.precision(chi_squared) * likelihood.count / max(valid, 1)
+    return Account(fitted, jacobian, likelihood, fit.prior(fitted), chi_squared)
 
 
 def laplace(
@@ -197,7 +194,7 @@ def _stepped(
     """The field after a step downhill; None where none is worth a solve."""
     fitted = account.fitted
     limited = partial(limited_step, fit, fitted)
-    scale = fit.prior(fitted)[0]
+    scale, _ = account.prior
     steps = damped_steps(normal, gradient, scale, fitted.damping, limited, account.unit)
     for step, damping in steps:
         parameters, ratio = fitted.parameters + step[:-1], fitted.log_ratio + float(step[-1])

@@ -23,7 +23,7 @@ import numpy as np
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray, IntArray
-from tactomo_models.methods.account import Account, Frame, unit_of
+from tactomo_models.methods.account import Account, Frame
 from tactomo_models.physics.forward import ForwardModel, Probes
 from tactomo_models.scene.field_fit import FieldFit
 from tactomo_models.scene.parameters import SIZE, SMALLEST_SIZE, UNIT_M, X, Y
@@ -97,10 +97,10 @@ class ContactSearch:
             gain[self._gaps_m(account.contacts) < NEAR_M] = 0.0
         # The best of so many places gains this much by noise alone. What a companion feels that no
         # contact explains yet says nothing of the sheets' noise.
-        residual = account.fitted.residual.copy()
-        residual[sum(map(len, account.fitted.residuals.values())) :] = 0.0
-        left = frame.likelihood.chi_squared(residual)
-        by_chance = 2 * np.log(len(self._nodes)) / unit_of(frame.likelihood, left)
+        felt = np.zeros_like(account.fitted.companion_residuals)
+        residual = np.concatenate([*account.fitted.residuals.values(), felt])
+        unit = frame.likelihood.unit(frame.likelihood.chi_squared(residual))
+        by_chance = 2 * np.log(len(self._nodes)) / unit
         found: list[MissingContact] = []
         for spot in np.argsort(-gain):
             if gain[spot] < by_chance or len(found) == MAX_MISSING:

@@ -38,7 +38,7 @@ class Prediction:
     log_evidence: float
     every: FloatArray  # (K, COLUMNS) all contacts
     log_ratio: float
-    gain: float  # what the last step takes off the cost
+    gain: float  # what the last step takes off chi-squared, by the unit of where it was asked
     own: IntArray  # (m,) which were asked about
     family: PressureField = field(repr=False)
     information: FloatArray = field(repr=False)  # (N + 1, N + 1) inverse covariance
@@ -115,7 +115,7 @@ def _of_kind(
     at = _At(
         family, family.bounded(family.join(each)), log_ratio, residual, jacobian, is_own & light
     )
-    return _end(fit, at, frame, own)
+    return _end(fit, at, frame, own, account.unit)
 
 
 def with_kind(
@@ -143,7 +143,7 @@ def at_end(
         account.jacobian,
         is_below,
     )
-    return _end(fit, at, frame, own)
+    return _end(fit, at, frame, own, account.unit)
 
 
 def start_of(
@@ -187,14 +187,14 @@ class _At:
     is_below: BoolArray  # (K,) contacts whose peaks stay below the graded sheet's onset
 
 
-def _end(fit: FieldFit, at: _At, frame: Frame, own: IntArray) -> Prediction:
+def _end(fit: FieldFit, at: _At, frame: Frame, own: IntArray, unit: float) -> Prediction:
     family, likelihood, J = at.family, frame.likelihood, at.jacobian
     precision, offset = fit.prior_of(family, at.parameters, at.log_ratio)
     normal = J.T @ J
     normal[np.diag_indices(len(normal))] += precision
     gradient = J.T @ at.residual + precision * offset
     step = _newton(fit, at, normal, gradient)
-    gain = -float((2 * gradient + normal @ step) @ step)
+    gain = -float((2 * gradient + normal @ step) @ step) * unit
     parameters = at.parameters + step[:-1]
     chi_squared = likelihood.chi_squared(at.residual + J @ step)
     found, _ = laplace(likelihood, family, parameters, J, chi_squared, precision, offset + step)

@@ -115,18 +115,15 @@ def to_be_asked(kind: Kind, rivals: Rivals) -> bool:
 
 
 def as_predicted(
-    found: Prediction, log_odds: float, contact: FloatArray, before: Rival | None, unit: float
+    found: Prediction, log_odds: float, contact: FloatArray, before: Rival | None
 ) -> Rival:
-    """A rival as it is predicted; as it was solved for, where the prediction is about the same.
-
-    `unit` is what one unit of cost is of chi-squared.
-    """
+    """A rival as it is predicted; as it was solved for, where the prediction is about the same."""
     if before is not None and before.is_solved:
         predicted = log_odds if before.predicted is None else before.predicted
         if abs(log_odds - predicted) < SAME:
             return replace(before, is_open=False, predicted=predicted, found=found)
     made = _rival_of(found, log_odds, contact, before)
-    return replace(made, predicted=log_odds, is_far=found.gain * unit > FAR_STEP)
+    return replace(made, predicted=log_odds, is_far=found.gain > FAR_STEP)
 
 
 def as_solved(

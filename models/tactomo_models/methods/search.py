@@ -315,7 +315,7 @@ class Search:
         which came there stays.
         """
         response = self.fit.responses.get(Channel.STRUCTURE)
-        precision, offset = self.fit.prior(account.fitted)
+        precision, offset = account.prior
         is_likely = precision[-1] * offset[-1] ** 2 < 1
         if not isinstance(response, SaturatingResponse) or is_likely or not _is_light(account):
             return account
@@ -387,10 +387,9 @@ class Search:
             return replace(belief, lacks_none=True)
         if not belief.is_parted:
             return self._joined(belief, frame)
-        precision = self.fit.prior(account.fitted)[0]
         return replace(
             belief,
-            since=Since.after(frame.measured, account.jacobian, precision),
+            since=Since.after(frame.measured, account.jacobian, account.prior[0]),
             asked_peaks=_pressed_peaks(account),
             done=True,
         )
@@ -436,9 +435,7 @@ class Search:
         found = predict(self.fit, self.field, account, asks, frame)
         for (k, kind), each in zip(asks, found, strict=True):
             before, log_odds = rivals[k].get(kind), each.log_evidence - now
-            rivals[k][kind] = as_predicted(
-                each, log_odds, account.contacts[k], before, account.unit
-            )
+            rivals[k][kind] = as_predicted(each, log_odds, account.contacts[k], before)
         for _ in {k for k, _ in asks}:
             frame.budget.spend(account.fitted)  # about what asking a contact takes
         return replace(belief, rivals=tuple(rivals))
@@ -486,7 +483,7 @@ class Search:
         for taken in range(steps):
             is_hopeless = found.log_evidence - now < HOPELESS
             # A step that would lose is cut at a limit: the end is still far.
-            if 0 <= found.gain * solved.unit < CHECKED or (is_hopeless and taken >= sure):
+            if 0 <= found.gain < CHECKED or (is_hopeless and taken >= sure):
                 break
             solved = self._descended(solved, frame, 1)
             found = at_end(self.fit, solved, frame, own)

@@ -63,6 +63,11 @@ class Likelihood:
         """Factor on the errors' inverse variance that is likely where this much is left."""
         return 2 * self.count / (self.count + chi_squared)
 
+    def unit(self, chi_squared: float) -> float:
+        """What one unit of cost, which counts all voltages alike, is of chi-squared here."""
+        valid = int(np.count_nonzero(self.deflation))
+        return self.precision(chi_squared) * self.count / max(valid, 1)
+
     def explains(self, chi_squared: float) -> bool:
         """Whether errors of the size that was told may leave so much."""
         return chi_squared < float(chdtri(self.count, FALSE_ALARM))
