@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import subprocess
 import sys
@@ -11,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import protocol_vectors as vectors
 import pytest
 from any_packets import PACKETS, SMALL_PACKETS
 from c_firmware import C_FOLDER, Speaker, answered, build, f64_bits
@@ -19,18 +17,13 @@ from cobs import cobs
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from needs import lacking, need
+from protocol_vectors import fields, load
 from tactomo_protocol import Command, Decoder, DecoderCounts, Packet, encode
 
-VECTORS = C_FOLDER.parent / "vectors"
 COMMAND_TYPE = 0x81
 JsonMap = dict[str, Any]
 # One program serves all examples.
 quickly = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-
-
-def load(name: str) -> list[JsonMap]:
-    found: list[JsonMap] = json.loads((VECTORS / name).read_text("utf-8"))["vectors"]
-    return found
 
 
 # --- what a device must make of a stream, by the Python decoder -----------------------------------
@@ -61,7 +54,7 @@ def seen_by_device(stream: bytes) -> tuple[list[Packet], DecoderCounts]:
 def assert_same(speaker: Speaker, stream: bytes, run: int | None = None) -> None:
     commands, counts = speaker.parse(stream, run)
     expected, expected_counts = seen_by_device(stream)
-    assert list(map(vectors.fields, commands)) == list(map(vectors.fields, expected))
+    assert list(map(fields, commands)) == list(map(fields, expected))
     assert counts == expected_counts
 
 
@@ -72,11 +65,11 @@ def test_each_vector_is_encoded_and_decoded_where_it_is_a_command(speaker: Speak
     for vector in load("packets.json"):
         frame, name = bytes.fromhex(vector["frame"]), vector["name"]
         [packet] = Decoder().feed(frame)
-        assert vectors.fields(packet) == vector["fields"], name
+        assert fields(packet) == vector["fields"], name
         assert speaker.encode(packet) == frame, name
         commands, counts = speaker.parse(frame)
         is_command = vector["fields"]["packet"] == "command"
-        assert [vectors.fields(c) for c in commands] == [vector["fields"]] * is_command, name
+        assert [fields(c) for c in commands] == [vector["fields"]] * is_command, name
         assert counts == DecoderCounts(packets=1, unknown_type=int(not is_command)), name
 
 
@@ -84,10 +77,10 @@ def test_each_stream_gives_its_commands_and_counts(speaker: Speaker) -> None:
     same = ("crc_errors", "cobs_errors", "oversize", "wrong_version")
     for vector in load("streams.json"):
         stream, name = bytes.fromhex(vector["stream"]), vector["name"]
-        expected = [fields for fields in vector["packets"] if fields["packet"] == "command"]
+        expected = [packet for packet in vector["packets"] if packet["packet"] == "command"]
         for run in (None, 1, 2, 7, 64):
             commands, counts = speaker.parse(stream, run)
-            assert [vectors.fields(command) for command in commands] == expected, name
+            assert [fields(command) for command in commands] == expected, name
             assert [getattr(counts, each) for each in same] == [
                 vector["counts"][each] for each in same
             ], name

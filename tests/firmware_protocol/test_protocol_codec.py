@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from protocol_vectors import stream_vectors
+from protocol_vectors import load
 from tactomo_protocol import (
     MAX_FRAME_BYTES,
     Acknowledge,
@@ -184,7 +184,7 @@ def test_a_field_that_the_wire_cannot_carry_is_named(
     ],
 )
 def test_the_rule_that_an_intact_frame_breaks_is_named(name: str, told: list[str]) -> None:
-    streams = {stream["name"]: stream["stream"] for stream in stream_vectors()}
+    streams = {stream["name"]: stream["stream"] for stream in load("streams.json")}
     decoder = Decoder()
     decoder.feed(bytes.fromhex(streams[name]))
     for part in told:

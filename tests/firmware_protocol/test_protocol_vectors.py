@@ -1,46 +1,17 @@
-"""The test vectors are current and mean what they say; `test_c_codec` is the second reading."""
+"""The test vectors mean what they say; `test_c_codec` is the second reading."""
 
 import ctypes
-import json
 import subprocess
-import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
-import protocol_vectors as vectors
 import pytest
 from cobs import cobs
 from needs import need
+from protocol_vectors import fields, load
 from tactomo_protocol import Decoder, encode
 
 FOLDER = Path(__file__).parents[2] / "firmware_protocol"
-JsonMap = dict[str, Any]
-
-
-def load(name: str) -> list[JsonMap]:
-    vectors: list[JsonMap] = json.loads((FOLDER / "vectors" / name).read_text("utf-8"))["vectors"]
-    return vectors
-
-
-# --- the vectors ----------------------------------------------------------------------------------
-
-
-def test_the_documented_command_writes_the_files_that_are_there(tmp_path: Path) -> None:
-    command = [sys.executable, vectors.__file__, str(tmp_path)]
-    subprocess.run(command, check=True, capture_output=True, timeout=60)
-    written = {path.name: path.read_text("utf-8") for path in tmp_path.iterdir()}
-    present = {path.name: path.read_text("utf-8") for path in (FOLDER / "vectors").iterdir()}
-    assert written == present, (
-        "run: python tests/support/protocol_vectors.py firmware_protocol/vectors"
-    )
-
-
-def test_the_command_says_when_there_is_no_such_folder(tmp_path: Path) -> None:
-    command = [sys.executable, vectors.__file__, str(tmp_path / "missing")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 2
-    assert "missing is not a folder" in done.stderr
 
 
 def test_packet_vectors() -> None:
@@ -50,7 +21,7 @@ def test_packet_vectors() -> None:
         assert frame[0] == frame[-1] == 0, name
         assert cobs.decode(frame[1:-1]) == payload, name
         [packet] = Decoder().feed(frame)
-        assert vectors.fields(packet) == vector["fields"], name
+        assert fields(packet) == vector["fields"], name
         assert encode(packet) == frame, name
 
 
@@ -61,7 +32,7 @@ def test_stream_vectors() -> None:
             decoder = Decoder()
             chunks = (stream[i : i + size] for i in range(0, len(stream), size))
             packets = [packet for chunk in chunks for packet in decoder.feed(chunk)]
-            assert [vectors.fields(packet) for packet in packets] == vector["packets"], (name, size)
+            assert [fields(packet) for packet in packets] == vector["packets"], (name, size)
             assert asdict(decoder.counts) == vector["counts"], (name, size)
 
 
