@@ -93,6 +93,11 @@ def test_the_daemon_has_no_more_options_than_a_person_types() -> None:
         (["ports"], {"serial"}),
         (["status", "--address", "ipc://@nobody"], {"zmq"}),
         (["tare", "--address", "ipc://@nobody"], {"zmq"}),
+        *(
+            ([command, "none.mcap"], set())
+            for command in ("doctor", "info", "plot", "recover", "replay")
+        ),
+        (["export", "none.mcap", "none.csv"], set()),
     ],
 )
 def test_nothing_heavy_is_imported_to_answer(words: list[str], needed: set[str]) -> None:

@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 import typer
 
+from tactomo.errors import RecordingError, os_errors_as
+
 DEFAULT_NAME = "skin"
 DEFAULT_DESCRIPTION = "paper_square"
 DEFAULT_STREAM = "tcp://127.0.0.1:5560"
@@ -57,7 +59,7 @@ def description_names() -> list[str]:
 
 
 def _known_method(context: typer.Context, name: str | None) -> str | None:
-    if name is None or context.resilient_parsing:
+    if name is None or name in METHODS or context.resilient_parsing:
         return name
     from tactomo_models.errors import MethodError
     from tactomo_models.methods.registry import find_method
@@ -202,7 +204,18 @@ ShownFile: TypeAlias = Annotated[
 Force: TypeAlias = Annotated[
     bool, typer.Option("--force", "-f", help="Overwrite an existing file without asking.")
 ]
+
 RecordingFile: TypeAlias = Annotated[Path, typer.Argument(help="A recording (.mcap).")]
+RecordingFiles: TypeAlias = Annotated[
+    Path, typer.Argument(help="A recording (.mcap), or the folder of one in several files.")
+]
+
+
+def need_recording(path: Path) -> None:
+    """Refuse a path that leads nowhere, before the modules that read recordings are imported."""
+    step = "give the path of a .mcap file"
+    with os_errors_as(RecordingError, f"cannot open the recording {path}", step):
+        path.stat()
 
 
 def frame_slice(text: str | None) -> slice | None:

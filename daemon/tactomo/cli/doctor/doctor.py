@@ -94,15 +94,16 @@ def doctor(
     a description, `--pattern` gives the order of the voltages, or the command takes the pattern
     that fits the zeros or the reciprocity. The report says how the file was read.
     """
+    chosen = options.frame_slice(frames)
+    if what is not None and what.suffix.lower() == ".mcap":
+        options.need_recording(what)
     from tactomo_client.keys import as_keys
     from tactomo_models.health.findings import worst
 
     from tactomo.cli.console import Console
     from tactomo.cli.doctor.evidence import of_daemon
     from tactomo.cli.doctor.stream_findings import stream_findings
-    from tactomo.cli.options import frame_slice
 
-    chosen = frame_slice(frames)
     with Console(stderr=True).status("examining") as line_shown:
         if what is None:
             if chosen is not None or array is not None:

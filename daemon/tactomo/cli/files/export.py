@@ -18,7 +18,14 @@ from tactomo.cli.files.recorded_frames import (
     ToOption,
     recorded_frames,
 )
-from tactomo.cli.options import Force, RecordedDescription, examples, typer_app
+from tactomo.cli.options import (
+    Force,
+    RecordedDescription,
+    RecordingFiles,
+    examples,
+    need_recording,
+    typer_app,
+)
 from tactomo.cli.output import say
 from tactomo.cli.plot.plot import prepare_file
 from tactomo.cli.run.foxglove import write_layout
@@ -45,12 +52,7 @@ app = typer_app()
     )
 )
 def export(
-    recording: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RECORDING", help="A recording (.mcap), or the folder of one in several files."
-        ),
-    ],
+    recording: RecordingFiles,
     output: Annotated[
         Path,
         typer.Argument(
@@ -110,6 +112,7 @@ def export(
     is_folder = ros2 or lerobot
     if robot is not None and not lerobot:
         raise typer.BadParameter("--robot is for --lerobot")
+    need_recording(recording)
     if is_folder:
         _prepare_folder(output)
     for file in (*([] if is_folder else [output]), *([layout] if layout else [])):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tactomo.cli.options import JsonOutput, examples, typer_app
+from tactomo.cli.options import JsonOutput, examples, need_recording, typer_app
 from tactomo.cli.output import print_json, table
 
 if TYPE_CHECKING:
@@ -102,6 +102,7 @@ def _date(time_ns: int) -> str:
 def _facts(what: str) -> dict[str, Any]:
     suffix = Path(what).suffix.lower()
     if suffix == ".mcap":
+        need_recording(Path(what))
         from tactomo.recordings.recording import open_recording
 
         return _recording_facts(open_recording(what))

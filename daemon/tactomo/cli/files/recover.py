@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tactomo.cli.options import RecordingFile, examples, typer_app
+from tactomo.cli.options import RecordingFile, examples, need_recording, typer_app
 from tactomo.cli.output import say
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ def recover(
     losses. The damaged file stays unchanged. A replay of the new file gives the maps of the live
     run. After a gap, the replay starts cold; where the reference is lost, there are no maps.
     """
+    need_recording(recording)
     from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn
 
     from tactomo.cli.console import Console

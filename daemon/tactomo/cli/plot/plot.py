@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli.files.recorded_frames import FromOption, ToOption, recorded_frames
-from tactomo.cli.options import Force, RecordedDescription, examples, typer_app
+from tactomo.cli.options import (
+    Force,
+    RecordedDescription,
+    RecordingFiles,
+    examples,
+    need_recording,
+    typer_app,
+)
 from tactomo.cli.output import say
 from tactomo.errors import TactomoError, needs, os_errors_as
 from tactomo.plain import counted
@@ -31,9 +38,7 @@ app = typer_app()
     )
 )
 def plot(
-    recording: Annotated[
-        Path, typer.Argument(help="A recording (.mcap), or the folder of one in several files.")
-    ],
+    recording: RecordingFiles,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="The picture: .png, .svg or .pdf.")
     ] = Path("recording.png"),
@@ -61,6 +66,7 @@ def plot(
     'tactomo[plot]'`.
     """
     panels = _panels(what)
+    need_recording(recording)
     prepare_picture(output, force=force)
     from tactomo.cli.plot.course import Course, read_course, read_maps
     from tactomo.cli.plot.page import draw_page

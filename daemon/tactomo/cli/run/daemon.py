@@ -158,10 +158,11 @@ def replay(
     With --viewer, the replay shows its first frame and waits until a browser opens the page. The
     page, or the command `replay` of the control socket, pauses, steps, moves and slows the replay.
     """
+    factor = _speed(speed)
+    options.need_recording(recording)
     from tactomo.cli.run.demo import free_of, show_replay
     from tactomo.recordings.recording import open_recording
 
-    factor = _speed(speed)
     stream, control = free_of((stream, options.DEFAULT_STREAM), (control, options.DEFAULT_CONTROL))
     opened = open_recording(recording)
     origin = opened.origin
