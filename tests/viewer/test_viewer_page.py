@@ -1001,7 +1001,7 @@ def test_recording_starts_and_stops(page: Page) -> None:
     page["record"].click()
     wait_until(lambda: page["message"].text == "Recording to /a.mcap")
     page.skin.status |= {"recording": {"path": "/a.mcap", "bytes": 12}}
-    wait_until(lambda: page["record"].get_attribute("aria-pressed") == "true")
+    wait_until(lambda: page["record"].accessible_name == "Stop the recording")
     page["record"].click()
     wait_until(lambda: ("record_stop", {}) in page.daemon.requests)
     assert [command for command, _ in page.daemon.requests] == ["record_start", "record_stop"]
@@ -1241,6 +1241,103 @@ const luminance = (name) => {
 const [a, b] = [luminance(arguments[0]), luminance(arguments[1])];
 return (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
 """
+
+
+FOCUSED = """
+const at = document.activeElement, seen = at.matches('.segmented input') ? at.nextSibling : at;
+const { outlineStyle, outlineWidth } = getComputedStyle(seen);
+const isMarked = outlineStyle !== 'none' && parseFloat(outlineWidth) >= 2;
+return [at.id || at.name || at.closest('table, ol')?.id, isMarked]"""
+
+
+def test_the_keyboard_reaches_and_shows_every_control(page: Page) -> None:
+    page.skin.press(36, -48)
+    page.open()
+    page.wait_until_pressable()
+    page.skin.status |= {"replay": REPLAY | {"exact": False}}
+    page.skin.events = [{"name": "tared", "severity": "info", "detail": "", "next_step": ""}]
+    wait_until(lambda: page["replay"].is_displayed() and "tared" in page["events"].text)
+    wait_until(lambda: page["count"].text == "1")
+    focused: list[tuple[str, bool]] = []
+    while not focused or focused[-1] != focused[0] or len(focused) == 1:
+        webdriver.ActionChains(page.browser).send_keys(Keys.TAB).perform()
+        focused.append(tuple(page.js(FOCUSED)))
+        assert len(focused) < 40
+    assert [name for name, is_marked in focused if name and not is_marked] == []
+    controls = "play step position speed loop moment zoom-out zoom-in pause method pressure size"
+    controls += (
+        " shape hold clear scale colormap smooth outline unit tare record map contacts events"
+    )
+    assert {name for name, _ in focused} >= set(controls.split())
+
+
+def test_a_reader_of_the_screen_is_told_what_changes(page: Page) -> None:
+    def regions() -> list[dict[str, Any]]:
+        nodes = page.browser.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
+        return [node for node in nodes if node.get("role", {}).get("value") == "status"]
+
+    page.open()
+    page.wait_until_pressable()
+    assert len(regions()) == 2  # both are there before anything is told
+    told = page["spoken"].get_attribute
+    wait_until(lambda: told("textContent") == "Nothing pressed.")
+    page.skin.press(36, -48)
+    page.skin.frame |= {"flags": ["misfit_high"]}
+    wait_until(lambda: told("textContent") == "1 contact, misfit high")
+    page["map"].send_keys(Keys.SHIFT, Keys.ARROW_RIGHT, Keys.SHIFT)
+    wait_until(lambda: told("textContent") == "1 contact, misfit high, x 10, y 0 mm: 0 kPa")
+    page.js("document.activeElement.blur()")
+    page.skin.sends_frames = False
+    wait_until(
+        lambda: str(told("textContent")).startswith("Stale. The newest frame is a while old")
+    )
+    assert told("aria-live") == "assertive"
+    for control, value in (("pressure", "180 kPa"), ("size", "30 mm"), ("moment", "now")):
+        assert page[control].get_attribute("aria-valuetext") == value
+
+
+def test_a_contact_is_marked_on_the_map_from_its_row(page: Page) -> None:
+    page.skin.press(36, -48)
+    page.open()
+    wait_until(lambda: page["count"].text == "1")
+
+    def is_marked() -> bool:  # in the colour of contact 1
+        return any(
+            np.allclose(page.colour(36 + r_mm, -48), (86, 180, 233), atol=8)
+            for r_mm in np.arange(12, 20, 0.2)
+        )
+
+    assert not is_marked()
+    page["contacts"].find_element(By.TAG_NAME, "button").send_keys("")
+    wait_until(is_marked)
+    page.js("document.activeElement.blur()")
+    wait_until(lambda: not is_marked())
+
+
+def test_an_event_leads_to_its_moment(page: Page) -> None:
+    event = {"name": "tared", "severity": "warning", "detail": "", "next_step": ""}
+    page.skin.press(36, -48)
+    page.open()
+    wait_until(lambda: page.js("return tactomo.timeline.frames.length") > 5)
+    page.skin.events = [event]
+    wait_until(lambda: "tared" in page["events"].text)
+    page.skin.press(-30, 30)
+    wait_until(lambda: sum(page.colour(30, -48)) < 60)
+    page["events"].find_element(By.TAG_NAME, "button").click()
+    wait_until(lambda: page.health == "paused")
+    wait_until(partial(is_bright, page, 30, -48))
+    page["pause"].click()
+    page.daemon.answers["replay"] = REPLAY
+    page.skin.status |= {"replay": REPLAY}
+    wait_until(lambda: page["replay"].is_displayed())
+    time.sleep(0.3)
+    page.skin.events = [event | {"name": "late"}]
+    wait_until(lambda: "late" in page["events"].text)
+    page["events"].find_element(By.TAG_NAME, "button").click()
+    wait_until(lambda: page.daemon.requests)
+    ((_, asked),) = page.daemon.requests
+    assert asked["paused"]
+    assert asked["position_s"] == pytest.approx(2.0, abs=0.5)
 
 
 def test_every_control_has_a_name(page: Page) -> None:

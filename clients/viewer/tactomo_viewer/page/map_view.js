@@ -8,6 +8,7 @@ const FINER = 5;           // intervals of the smooth image for each one of the 
 const OUTLINE_FINER = 3;
 const ELECTRODE_MM = [6, 2.4];  // drawn size: along the rim, across it
 const NARROW_PX = 520;     // below this the colour bar lies under the map
+const MARK_PX = 8;         // from a contact's rim to its mark
 const TICK_PX = 28;        // the least room of a number under the map
 
 /** The corners of a sheet's bounding box. */
@@ -119,7 +120,7 @@ export class MapView {
   /**
    * Draw everything. `scene` has: frame (or null), image (what to colour, or null), scale (its top),
    * unit (for the colour bar), label(contact), colormap, smooth, outline,
-   * presses (list of {x, y, size, shape, pressure}), cursor ([x, y] or null).
+   * presses (list of {x, y, size, shape, pressure}), cursor ([x, y] or null), marked (a contact's id).
    */
   draw(scene) {
     const c = this.context;
@@ -136,7 +137,10 @@ export class MapView {
     if (scene.outline && scene.frame?.images.structure) this.#outline(c, scene.frame);
     for (const press of scene.presses) this.#press(c, press);
     if (scene.cursor) this.#cursor(c, scene.cursor);
-    for (const contact of scene.frame?.contacts ?? []) this.#contact(c, contact, scene.label(contact));
+    for (const contact of scene.frame?.contacts ?? []) {
+      if (contact.id === scene.marked) this.#mark(c, contact);
+      this.#contact(c, contact, scene.label(contact));
+    }
     if (scene.image) this.#colourBar(c, scene);
   }
 
@@ -246,6 +250,13 @@ export class MapView {
     c.textAlign = "left";
     c.fillStyle = "#ffffff";
     c.fillText(label, bx + numberWidth + 6, by + 11.5);
+  }
+
+  // A circle around as much as the contact covers.
+  #mark(c, { id, x_mm: x, y_mm: y, area_mm2: area }) {
+    c.beginPath();
+    c.arc(...this.mmToPixel(x, y), Math.sqrt(area / Math.PI) * this.plot.scale + MARK_PX, 0, 7);
+    halo(c, 3, contactColour(id), "rgba(0, 0, 0, 0.65)");
   }
 
   #press(c, { x, y, size, shape }) {

@@ -20,7 +20,8 @@ export function showContacts(contacts, unit) {
     const row = document.createElement("tr");
     for (let i = 0; i < 6; i++) row.append(document.createElement(i ? "td" : "th"));
     row.cells[0].scope = "row";
-    row.cells[0].append(element("span"));
+    row.cells[0].append(element("button"));
+    row.cells[0].firstChild.type = "button";
     return row;
   });
   contacts.forEach((contact, i) => {
@@ -28,6 +29,7 @@ export function showContacts(contacts, unit) {
     Object.assign(row.dataset, { id: contact.id, xMm: contact.x_mm, yMm: contact.y_mm });
     const id = row.cells[0].firstChild;
     setText(id, String(contact.id));
+    id.ariaLabel = `Mark contact ${contact.id} on the map`;
     id.style.background = contactColour(contact.id);
     const touched = contact.pressure_range === "below" ? "touched" : "–";
     const texts = [
@@ -98,7 +100,8 @@ export function showStatus(status, isCurrent) {
     ? `Reference of ${reference.scans} scans, taken ${clock(reference.taken_realtime_ns)}.`
     : "No reference yet.");
   const record = byId("record");
-  record.setAttribute("aria-pressed", String(Boolean(recording)));
+  record.classList.toggle("on", Boolean(recording));
+  record.ariaLabel = recording ? "Stop the recording" : "Record";
   setText(record, recording ? `Stop · ${bytes(recording.bytes)}` : "Record");
   record.title = recording ? recording.path : "Record the bytes of the ports to a file";
   showMethods(status);
@@ -172,22 +175,26 @@ function showChannels({ state, ports, rates, events, companions = {}, companion_
     list.children[i].className = i < issues.length || name.length > 24 ? "issue" : "";
     const [dot, label, value] = list.children[i].children;
     dot.dataset.kind = kind;
-    dot.title = kind;
+    Object.assign(dot, { title: kind, role: "img", ariaLabel: kind || "no verdict" });
     setText(label, name);
     setWords(value, text);
   });
 }
 
-/** Take an event into the list; `at` is when it happened, in ms since 1970. */
-export function showEvent(event, at) {
+/** Take an event into the list, happened at `at`, ms since 1970; `go()` shows that moment. */
+export function showEvent(event, at, go) {
   const item = element("li");
   item.dataset.severity = event.severity;
   item.dataset.name = event.name;
-  const when = element("time", new Date(at).toLocaleTimeString());
-  const name = element("strong", String(event.name).replaceAll("_", " "));
+  const button = element("button");
+  Object.assign(button, { type: "button", title: "Show this moment", onclick: go });
+  const severity = element("span", ["warning", "error"].includes(event.severity) ? event.severity : "");
+  severity.className = "unseen";
+  button.append(element("time", new Date(at).toLocaleTimeString()), severity,
+    element("strong", String(event.name).replaceAll("_", " ")));
   const words = element("span");
   setWords(words, [event.detail, event.next_step].filter(Boolean).join("; "));
-  item.append(when, name, words);
+  item.append(button, words);
   const list = byId("events");
   list.prepend(item);
   while (list.children.length > EVENTS_SHOWN) list.lastChild.remove();

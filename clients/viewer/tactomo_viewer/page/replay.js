@@ -3,6 +3,8 @@
 import { byId, setText } from "./panels.js";
 import { fixed } from "./values.js";
 
+const REMEMBERED_MS = 10_000;
+
 export class Replay {
   /** `command(name, arguments)` asks the daemon, and tells what it refuses. */
   constructor(command) {
@@ -10,6 +12,7 @@ export class Replay {
     this.fields = null;
     this.stoodAt = -Infinity;  // until when no frame was to come
     this.moves = null;  // where it is to go on, until that is answered
+    this.stood = [];  // {at, position_s}: where it was in the last while
     byId("play").onclick = () => this.#ask(
       this.#hasEnded ? { position_s: 0, paused: false } : { paused: !this.fields.paused });
     byId("step").onclick = () => this.#ask({ step: true });
@@ -54,6 +57,17 @@ export class Replay {
     if (!slider.matches(":active") && this.moves === null) slider.value = position;
     setText(byId("position-text"), `${fixed(Number(slider.value), 1)} / ${fixed(fields.duration_s, 1)} s`);
     slider.ariaValueText = `${fixed(Number(slider.value), 1)} s`;
+    this.stood = [...this.stood.filter(({ at }) => at > now - REMEMBERED_MS), { at: now, position_s: position }];
+  }
+
+  /** Where the replay was at a moment of performance.now(); undefined where nobody saw. */
+  positionAt(moment) {
+    return this.stood.findLast(({ at }) => at <= moment)?.position_s;
+  }
+
+  /** Pause the replay at a position. */
+  standAt(position_s) {
+    return this.#ask({ position_s, paused: true });
   }
 
   /** Whether a frame is of before the last move: replies and frames come by different sockets. */

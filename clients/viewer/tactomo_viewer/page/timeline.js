@@ -67,7 +67,15 @@ export class Timeline {
   goLive() {
     this.pausedAt = null;
     this.slider.value = 0;
+    this.slider.ariaValueText = "now";
     this.onLook();
+  }
+
+  /** Look back at a moment; false where no frame of it is kept. */
+  lookAt(at) {
+    if (!(this.frames[0]?.at <= at)) return false;
+    this.#lookAt(at);
+    return true;
   }
 
   /** Show a shorter time, or a longer one, around a moment; the right end stays at the newest. */
@@ -149,9 +157,12 @@ export class Timeline {
   }
 
   #scrub({ offsetX, buttons }) {
-    if (!buttons) return;
+    if (buttons) this.#lookAt(this.#time(offsetX));
+  }
+
+  #lookAt(at) {
     this.pause();
-    this.slider.value = Math.round(this.#time(offsetX) - this.pausedAt);
+    this.slider.value = Math.round(at - this.pausedAt);
     this.#look();
   }
 

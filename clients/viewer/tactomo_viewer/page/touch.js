@@ -61,7 +61,7 @@ export class Touch {
     if (enabled === this.enabled) return;
     this.enabled = enabled;
     for (const canvas of this.canvases) canvas.classList.toggle("pressable", enabled);
-    this.view.canvas.role = enabled ? "application" : "img";
+    Object.assign(this.view.canvas, { role: enabled ? "application" : "img", tabIndex: enabled ? 0 : -1 });
     if (!enabled) {
       this.down.clear();
       this.held = [];

@@ -13,6 +13,7 @@ import { UNITS, fixed, pressureOf, pressureText, seconds } from "./values.js";
 const PANEL_MS = 100;       // how often the texts beside the map change
 const FALLBACK_TOP = { kpa: 300, percent: 30 };
 const PAINTED = 120;        // frames that rate and latency are taken over
+const SPOKEN_MS = 1000;     // how long words stay before they are spoken
 const NEAR_MM = 10;         // beyond a press's rim a contact is another's
 
 const state = {
@@ -97,8 +98,10 @@ function onMessage(message) {
       replay.show(state.status, state.hello, state.drawn !== null);
     },
     event: () => {
-      showEvent(message.event, Date.now() - message.age_ms);
-      timeline.note(message.event, performance.now() - message.age_ms);
+      const at = performance.now() - message.age_ms;
+      const position = replay.positionAt(at);
+      showEvent(message.event, Date.now() - message.age_ms, () => goTo(at, position));
+      timeline.note(message.event, at);
     },
     twin: () => { state.twin = message; },
   };
@@ -185,6 +188,7 @@ function draw() {
     outline: byId("outline").checked,
     presses: touch.presses,
     cursor: touch.cursor,
+    marked: Number(document.querySelector("#contacts tr:is(:hover, :focus-within)")?.dataset.id),
   };
   view.draw(scene);
   if (!byId("surface-room").hidden) surface?.draw(scene);
@@ -285,8 +289,8 @@ function refresh() {
   setText(byId("map-help"), found ? "" : helpText(canPress));
   showNumbers(now);
   showReadout();
+  speak(found, now);
   const isPaused = timeline.isPaused;
-  byId("pause").setAttribute("aria-pressed", String(isPaused));
   setText(byId("pause"), isPaused ? "Back to now" : "Pause");
   const stands = ["ended", "replay-paused"].includes(live?.name) && state.frame;
   timeline.draw({
@@ -331,14 +335,43 @@ function showBanner(found) {
   const key = found.name + found.level + found.title;
   if (key !== bannerShown) {
     bannerShown = key;
-    box.role = found.level === "info" ? "status" : "alert";
     box.dataset.name = found.name;
     box.dataset.level = found.level;
     box.querySelector("strong").textContent = found.title;
   }
-  const detail = box.querySelector("span");
-  detail.ariaLive = "off";
-  setWords(detail, found.detail);
+  setWords(box.querySelector("span"), found.detail);
+}
+
+let unspoken = { words: "", since: 0 };
+
+// What a reader of the screen is to speak, once it has stayed for a while: what numbers count up or
+// flicker between is not. The table has the contacts' values.
+function speak(found, now) {
+  const [title, detail] = [found?.title, found?.name === "paused" ? "" : found?.detail];
+  const contacts = byId("count").textContent;
+  const all = [
+    title && `${title} ${detail}`.replace(/[\d.]+ s\b/g, "a while"),
+    idle.isOn ? byId("map-help").textContent
+      : contacts ? `${contacts} contact${contacts === "1" ? "" : "s"}` : byId("no-contacts").textContent,
+    ...[...byId("quality").children].map(({ textContent: flag }) => (flag === "good" ? "" : flag)),
+    touch.cursor && byId("readout").textContent,
+  ];
+  const words = all.filter(Boolean).join(", ");
+  if (words !== unspoken.words) unspoken = { words, since: now };
+  else if (now - unspoken.since > SPOKEN_MS) {
+    byId("spoken").ariaLive = found?.level === "error" ? "assertive" : "polite";
+    setWords(byId("spoken"), words);
+  }
+}
+
+// Show the moment of an event: a replay stands there; of a live skin the last minute is kept.
+function goTo(at, position) {
+  if (position !== undefined && state.status.fields.replay) {
+    timeline.goLive();
+    replay.standAt(position);
+  } else if (!timeline.lookAt(at)) {
+    say("The page keeps no frame of that moment: only the last 60 s since it was opened.", false);
+  }
 }
 
 function showNumbers(now) {
@@ -378,8 +411,10 @@ function indenter() {
 }
 
 function showIndenter() {
-  setText(byId("pressure-value"), `${byId("pressure").value} kPa`);
-  setText(byId("size-value"), `${byId("size").value} mm`);
+  for (const [id, unit] of [["pressure", "kPa"], ["size", "mm"]]) {
+    byId(id).ariaValueText = `${byId(id).value} ${unit}`;
+    setText(byId(`${id}-value`), byId(id).ariaValueText);
+  }
   touch.refresh();
   redraw();
 }
@@ -449,9 +484,11 @@ for (const id of ["map", "surface"]) {
   });
 }
 for (const event of ["pointermove", "pointerleave"]) byId("strip").addEventListener(event, refresh);
+for (const event of ["pointerover", "pointerout", "focusin", "focusout"]) byId("contacts").addEventListener(event, redraw);
 
 function showReadout() {
-  setText(byId("readout"), pointer && view.isOnSheet(...pointer) ? readout(...pointer) : timeline.readout);
+  const place = pointer ?? touch.cursor;
+  setText(byId("readout"), place && view.isOnSheet(...place) ? readout(...place) : timeline.readout);
 }
 
 function readout(x, y) {
