@@ -72,7 +72,6 @@ FOREIGN = {
     "torch": ("tactomo_lab.training.",),
     "onnx": ("tactomo_lab.training.",),
     "mujoco": ("tactomo_models.simulators.mujoco_skin.",),
-    "gymnasium": ("tactomo_models.simulators.gymnasium_skin.",),
     "ezdxf": ("tactomo_models.imported.",),
     "svgelements": ("tactomo_models.imported.",),
     "h5py": ("tactomo_models.matlab_file",),

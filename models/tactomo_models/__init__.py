@@ -22,7 +22,7 @@ calibration      pressure curves from a load cell
 health           faults of a skin or its leads
 drift            a reference that follows the skin
 commissioning    teaching one skin, and objects on that skin at a start
-simulators       the skin in MuJoCo and Gymnasium
+simulators       the skin in MuJoCo
 ===============  =================================================================================
 
 Below the last two, `reconstruct` turns scans into frames, and `batch` does so for a file.

@@ -1,1 +1,1 @@
-"""The skin in other people's simulators: MuJoCo, and Gymnasium on top of it."""
+"""The skin in other people's simulators: MuJoCo."""
