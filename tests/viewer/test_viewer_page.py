@@ -801,6 +801,11 @@ def test_an_outage_is_told_and_each_event_stands_where_it_happened(page: Page) -
     wait_until(lambda: page.js("return tactomo.timeline.events.length") == 2)
     page.skin.sends_frames = True
     wait_until(lambda: page.health == "good")
+    page.js("tactomo.timeline.lookAt(tactomo.timeline.events[1].at)")
+    wait_until(lambda: page.banner.startswith("Looking back. No data then"))
+    assert page["no-contacts"].text == "Not known."
+    assert "stale" in page.map_classes
+    page["pause"].click()
     apart_ms = page.js("const [a, b] = tactomo.timeline.events; return b.at - a.at")
     assert apart_ms > 1400
     times = "return [...document.querySelectorAll('#events time')].map((t) => t.textContent)"

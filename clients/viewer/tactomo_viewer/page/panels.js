@@ -64,8 +64,9 @@ export function showState(name, text = STATES[name] ?? String(name)) {
 
 /** The newest frame's quality; flags of a frame that is out of date say nothing about now. */
 export function showQuality(frame, trusted) {
-  setText(byId("misfit"), frame.misfit === null ? "–" : `${fixed(frame.misfit, 1)} σ`);
-  setText(byId("confidence"), frame.confidence === null ? "–" : `${fixed(100 * frame.confidence, 0)} %`);
+  const { misfit, confidence } = trusted ? frame : { misfit: null, confidence: null };
+  setText(byId("misfit"), misfit === null ? "–" : `${fixed(misfit, 1)} σ`);
+  setText(byId("confidence"), confidence === null ? "–" : `${fixed(100 * confidence, 0)} %`);
   setText(byId("made-by"), frame.tier ?? "–");
   setText(byId("made-by-reason"), frame.tier_reason ?? "");
   const list = byId("quality");

@@ -86,10 +86,13 @@ export class Timeline {
     this.onLook();
   }
 
-  /** The frame of the moment looked at, {at, frame}; null where that is now, or before all frames. */
+  /**
+   * The frame of the moment looked at, {at, frame, isKnown}; null where that is now, or there is none.
+   * It is not known what was in an outage: the frame is that of before.
+   */
   get shown() {
-    if (!this.isPaused) return null;
-    return this.#frameAt(this.#moment) ?? this.frames[0] ?? null;
+    const found = this.isPaused && (this.#frameAt(this.#moment) ?? this.frames[0]);
+    return found ? { ...found, isKnown: this.#moment - found.at <= this.options.gapMs } : null;
   }
 
   /** What was at the pointer, or at the moment looked at, in words; nothing where there is neither. */
@@ -237,10 +240,13 @@ export class Timeline {
       c.fillRect(x0, 0, x1 - x0, this.lanes.bottom);
       const text = `no data for ${seconds(ends[i] - at)}`;
       if (!isGap || c.measureText(text).width + 8 > x1 - x0) return;
+      const [x, y, room] = [(x0 + x1) / 2, this.lanes.height / 2, c.measureText(text).width + 8];
+      c.fillStyle = this.theme.background;
+      c.fillRect(x - room / 2, y - 8, room, 16);
       c.fillStyle = this.theme.text;
       c.textAlign = "center";
       c.textBaseline = "middle";
-      c.fillText(text, (x0 + x1) / 2, this.lanes.height / 2);
+      c.fillText(text, x, y);
     });
   }
 

@@ -266,7 +266,7 @@ function refresh() {
   const past = timeline.shown;
   const found = past && live?.level !== "error" ? pausedBanner(past, now) : live;
   showBanner(found);
-  state.isCurrent = past !== null || isMapCurrent(found);
+  state.isCurrent = past?.isKnown ?? isMapCurrent(found);
   for (const id of ["map", "surface"]) byId(id).classList.toggle("stale", !state.isCurrent);
   document.body.dataset.health = found?.name ?? (state.status ? "good" : "connecting");
   const linked = isHeard(state, now);
@@ -317,8 +317,9 @@ function helpText(canPress) {
     : "";
 }
 
-function pausedBanner({ frame, at }, now) {
-  const detail = `The map shows the frame of ${seconds(now - at)} ago; the skin goes on.`;
+function pausedBanner({ frame, at, isKnown }, now) {
+  const detail = isKnown ? `The map shows the frame of ${seconds(now - at)} ago; the skin goes on.`
+    : `No data then: the newest frame before is of ${seconds(now - at)} ago.`;
   return { name: "paused", level: "info", title: "Looking back.", detail, frame };
 }
 
