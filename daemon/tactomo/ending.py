@@ -15,10 +15,13 @@ ASKED: Final = (signal.SIGTERM, signal.SIGINT)
 AS_WELL: Final = (signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1, signal.SIGUSR2)
 
 
+def that_end() -> tuple[signal.Signals, ...]:
+    """The signals that ask this process to end."""
+    as_well = (each for each in AS_WELL if signal.getsignal(each) is not signal.SIG_IGN)
+    return (*ASKED, *as_well)
+
+
 def at_end(handler: Callable[[int, Any], Any]) -> None:
     """Have a handler called by whatever asks this process to end; for the main thread."""
-    for number in ASKED:
+    for number in that_end():
         signal.signal(number, handler)
-    for number in AS_WELL:
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, handler)

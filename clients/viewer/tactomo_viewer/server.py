@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import signal
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Collection
 from importlib import resources
 
 from aiohttp import WSCloseCode, web
@@ -74,22 +74,25 @@ class Viewer:
         self._sensor, self._stream, self._host, self._keys = sensor, stream, host, keys
         self._feed: Feed
 
-    def serve(self, port: int | None = None) -> None:
-        """Serve until SIGINT or SIGTERM; print the page's URL on stdout once it can be opened.
+    def serve(
+        self, port: int | None = None, until: Collection[int] = (signal.SIGINT, signal.SIGTERM)
+    ) -> None:
+        """Serve until a signal; print the page's URL on stdout once it can be opened.
 
         Args:
             port: the port to listen on; 0 takes a free one, None the first free one from
                 `DEFAULT_PORT` on.
+            until: the signals that end it.
 
         Raises:
             ViewerError: the address cannot be listened on.
             ClientError: the sensor's name is none, or the stream's address.
         """
-        asyncio.run(self._serve(port))
+        asyncio.run(self._serve(port, until))
 
-    async def _serve(self, port: int | None) -> None:
+    async def _serve(self, port: int | None, until: Collection[int]) -> None:
         stop = asyncio.Event()
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in until:
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
         runner = web.AppRunner(self.app(), access_log=None, shutdown_timeout=1.0)
         await runner.setup()

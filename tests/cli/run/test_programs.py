@@ -160,6 +160,17 @@ def test_a_child_that_fails_takes_the_demo_down_and_its_words_are_shown(tactomo:
     assert "cannot read the sensor description nosuch" in result.stderr
 
 
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGQUIT])
+def test_a_viewer_ends_in_order_with_its_terminal(start: Run, number: signal.Signals) -> None:
+    nobody = "tcp://127.0.0.1:1"
+    where = ("--sensor", "left", "--address", nobody, "--control", nobody)
+    viewer = start("viewer", *where, "--viewer-port", 0)
+    assert viewer.stdout.readline().startswith("viewer: ")
+    viewer.send_signal(number)
+    assert viewer.wait(PATIENCE_S) == 0
+    assert viewer.stdout.read() == ""
+
+
 @linux
 def test_a_demo_leaves_no_process_behind(start: Run) -> None:
     free = "tcp://127.0.0.1:0"

@@ -37,6 +37,8 @@ def viewer(
     from tactomo_client.keys import as_keys
     from tactomo_viewer import Viewer
 
+    from tactomo.ending import that_end
+
     if control and sensor and address:  # of a daemon that is on its way
         found = Running("daemon", control, sensor, address)
     else:
@@ -44,4 +46,4 @@ def viewer(
         twin_control = twin_control or twin_of(found)
     addresses = found.sensor, found.stream, found.control
     viewer = Viewer(*addresses, twin_control, host, as_keys(keys), press_itself)
-    viewer.serve(viewer_port)
+    viewer.serve(viewer_port, that_end())
