@@ -391,8 +391,8 @@ class Events:
     calibration_refused = WARNING
     #: The pressure calibration and the teaching were read again and are in force
     calibration_reloaded = INFO
-    #: A port has another device than before, and the new device is used. Tare if the skin is
-    #: another one
+    #: A port, or the sensor at a start, has another device than before, and the new device is used.
+    #: Exchange the cables back, or tare if the skin is another one
     device_changed = FREQUENT
     #: Nothing came over an open port for 3 s (or three periods of a slower device, or as long as
     #: its protocol allows). The daemon asks the device again; later the daemon reopens the port,

@@ -73,11 +73,23 @@ class KeptReference:
         self._next_s = 0.0
 
     def read(self, device_ids: Collection[str]) -> KnownSkin | None:
-        """Return what is kept, if it is of this description and of these devices."""
+        """Return what is kept, if it is of this description and of these devices.
+
+        Tells where other devices are: as well as a port can, see `device_changed`.
+        """
         try:
             arrays = read_arrays(self._path)
-            about = [str(arrays["description_sha256"]), *map(str, arrays["device_ids"])]
-            if about != self._about(device_ids):
+            sha256, *before = self._about([str(each) for each in arrays["device_ids"]])
+            if str(arrays["description_sha256"]) != sha256:
+                return None
+            if new := sorted(set(device_ids) - set(before)):
+                self._on_event(
+                    "device_changed",
+                    f"at the start, {', '.join(new)} instead of {', '.join(before)}",
+                    "exchange the cables or ports back, if those of two skins are exchanged; "
+                    "`device_ids` refuses other devices",
+                )
+            if sorted(device_ids) != before:
                 return None
             return KnownSkin(self._reference(arrays), int(arrays["realtime_ns"]))
         except FileNotFoundError:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -119,6 +120,26 @@ def test_another_skin_is_not_taken_for_a_load(begin: Any) -> None:
     b.listener.event("tared")
     frame = b.step(volts=other)
     assert (frame["contacts"], frame["flags"]) == ([], [])
+
+
+@pytest.mark.parametrize("exchanged", [("own-0", "other-1"), ("other-0", "other-1")])
+def test_boards_of_another_skin_are_named_at_the_start(
+    bench: Start, exchanged: tuple[str, str]
+) -> None:
+    """Two daemons whose cables were exchanged while they were off: of one sheet, or of both."""
+
+    def start(*device_ids: str) -> Any:
+        b = bench(ports=2, baseline={"track": True}, real=True)
+        for line, device_id in zip(b.skin.lines, device_ids, strict=True):
+            line.hello = replace(line.hello, device_id=device_id)
+        b.tare()
+        return b
+
+    start("own-0", "own-1").daemon.stop()
+    told = start(*exchanged).listener.event("device_changed")
+    others = ", ".join(name for name in exchanged if name.startswith("other"))
+    assert told["detail"] == f"at the start, {others} instead of own-0, own-1"
+    assert "exchange" in told["next_step"]
 
 
 @pytest.mark.slow
