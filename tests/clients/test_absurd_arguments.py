@@ -32,8 +32,8 @@ def doors() -> dict[str, tuple[str, Callable[[Any], Any]]]:
         "daemon": ("timeout_s", lambda t: Daemon(NOWHERE, timeout_s=t)),
         "daemon connects": ("connect_timeout_s", lambda t: Daemon(NOWHERE, connect_timeout_s=t)),
         "tare": ("timeout_s", lambda t: Daemon(NOWHERE).tare(t)),
-        "aio daemon": ("timeout_s", lambda t: aio.Daemon(NOWHERE, timeout_s=t)),
-        "aio tare": ("timeout_s", lambda t: asyncio.run(aio.Daemon(NOWHERE).tare(t))),
+        "aio control": ("timeout_s", lambda t: aio.Control(NOWHERE, timeout_s=t)),
+        "aio tare": ("timeout_s", lambda t: asyncio.run(aio.Control(NOWHERE).request("tare", t))),
     }
 
 

@@ -94,9 +94,9 @@ def pressed(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeSensor]:
 def control(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeControl]:
     """A control socket where `Daemon` looks by default."""
     with FakeControl({"tare": {"scans": 20}, "status": {"state": "running"}}) as fake:
-        for module in (tactomo_client, aio):
-            daemon = module.Daemon
-            monkeypatch.setattr(module, "Daemon", lambda of=daemon: of(fake.address))
+        for module, name in ((tactomo_client, "Daemon"), (aio, "Control")):
+            made = getattr(module, name)
+            monkeypatch.setattr(module, name, lambda of=made: of(fake.address))
         yield fake
 
 

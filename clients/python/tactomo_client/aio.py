@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Self, TypeVar, Unpack, cast, overload
@@ -30,30 +29,14 @@ import zmq
 import zmq.asyncio
 
 from tactomo_client.connection import Owner, Waiting
-from tactomo_client.control import (
-    RECORD_TIMEOUT_S,
-    RELOAD_TIMEOUT_S,
-    TARE_TIMEOUT_S,
-    TIMEOUT_S,
-    BudgetInForce,
-    CalibrationInForce,
-    ControlLine,
-    MethodInForce,
-    RecordedFile,
-    RecordingStarted,
-    RunningRecording,
-    Tare,
-    record_arguments,
-    to_status,
-)
-from tactomo_client.errors import ClientError, checked_seconds
-from tactomo_client.filled import filled
+from tactomo_client.control import TIMEOUT_S, ControlLine
+from tactomo_client.errors import checked_seconds
 from tactomo_client.keys import Keys
 from tactomo_client.messages import DEFAULT_CONTROL
 from tactomo_client.schema import Event, Frame, Status
 from tactomo_client.subscription import Item, Kind, Options, Reception, T_co
 
-__all__ = ["Control", "Daemon", "Subscription", "request", "subscribe"]
+__all__ = ["Control", "Subscription", "request", "subscribe"]
 
 T = TypeVar("T")
 
@@ -178,69 +161,6 @@ class Control(ControlLine):
 
     async def __aexit__(self, *_: object) -> None:
         self.close()
-
-
-class Daemon(Control):
-    """A running daemon, to be given commands: `tactomo_client.Daemon` for asyncio.
-
-    Commands, arguments, results and errors are the same.
-
-    Example::
-
-        async with Daemon() as daemon:
-            await daemon.tare()
-            async with daemon.record("grasp.mcap", maps=True):
-                await grasp()
-    """
-
-    async def status(self) -> Status:
-        """Return how it is: what `tactomo status` shows."""
-        return to_status(await self.request("status"))
-
-    async def tare(self, timeout_s: float = TARE_TIMEOUT_S) -> Tare:
-        """Take a new reference: the next scans of the *unloaded* skin count as nothing pressed."""
-        return filled(Tare, await self.request("tare", timeout_s))
-
-    async def record_start(
-        self, path: str | Path | None = None, *, maps: bool | None = None
-    ) -> RecordingStarted:
-        """Start a recording of what the ports say, which goes on until `record_stop`."""
-        arguments = record_arguments(path, maps)
-        result = await self.request("record_start", RECORD_TIMEOUT_S, **arguments)
-        return filled(RecordingStarted, result)
-
-    async def record_stop(self) -> RecordedFile:
-        """Stop the recording."""
-        return filled(RecordedFile, await self.request("record_stop", RECORD_TIMEOUT_S))
-
-    @asynccontextmanager
-    async def record(
-        self, path: str | Path | None = None, *, maps: bool | None = None
-    ) -> AsyncIterator[RunningRecording]:
-        """Record during an `async with` block."""
-        recording = RunningRecording((await self.record_start(path, maps=maps)).path)
-        try:
-            yield recording
-        except BaseException:
-            with suppress(ClientError):  # what happened in the block is what counts
-                await self.record_stop()
-            raise
-        recording.file = await self.record_stop()
-
-    async def set_method(self, method: str) -> MethodInForce:
-        """Choose what solves frames."""
-        return filled(MethodInForce, await self.request("set_tier", tier=method))
-
-    set_tier = set_method  # as the stream calls it
-
-    async def set_budget(self, budget_ms: float | None) -> BudgetInForce:
-        """Choose how long a frame may take, ms; None leaves it to the method."""
-        return filled(BudgetInForce, await self.request("set_budget", budget_ms=budget_ms))
-
-    async def reload_calibration(self) -> CalibrationInForce:
-        """Have the sensor's pressure calibration read again: a new one is in force at once."""
-        result = await self.request("reload_calibration", RELOAD_TIMEOUT_S)
-        return filled(CalibrationInForce, result)
 
 
 async def _wait(steps: Waiting[T]) -> T:

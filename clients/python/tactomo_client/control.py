@@ -268,7 +268,9 @@ class Daemon(Control):
             AlreadyRecording: one runs.
             CannotWrite: the file exists, or cannot be created, or the disk is full.
         """
-        arguments = record_arguments(path, maps)
+        arguments: dict[str, Any] = {} if path is None else {"path": str(path)}
+        if maps is not None:
+            arguments["maps"] = maps
         return filled(RecordingStarted, self.request("record_start", RECORD_TIMEOUT_S, **arguments))
 
     def record_stop(self) -> RecordedFile:
@@ -335,12 +337,6 @@ class Daemon(Control):
 def to_status(result: Mapping[str, Any]) -> Status:
     """Return the status in the reply to the command of that name, which has just come."""
     return Status.from_fields(result, time.monotonic_ns(), STALE_AFTER_S)
-
-
-def record_arguments(path: str | Path | None, maps: bool | None) -> dict[str, Any]:
-    """Return the arguments of `record_start` that are given."""
-    where = {} if path is None else {"path": str(path)}
-    return where if maps is None else {**where, "maps": maps}
 
 
 def _no_answer(connection: Connection, waited_s: float) -> ControlError:

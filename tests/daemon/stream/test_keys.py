@@ -136,13 +136,13 @@ def test_a_stranger_is_turned_away_in_an_event_loop_until_allowed(
         stream, control = guarded.daemon.stream_address, guarded.daemon.control_address
         async with (
             aio.subscribe(SERVER, address=stream, kind="status", keys=folder) as statuses,
-            aio.Daemon(control, keys=folder, timeout_s=PATIENCE_S) as daemon,
+            aio.Control(control, keys=folder, timeout_s=PATIENCE_S) as daemon,
             asyncio.timeout(PATIENCE_S),
         ):
             with pytest.raises(KeysError, match="does not let this client in"):
                 await anext(statuses)
             with pytest.raises(KeysError, match="does not let this client in"):
-                await daemon.status()
+                await daemon.request("status")
             robot.allow(folder, may_command=True)
             while True:  # it knocks again by itself
                 with contextlib.suppress(KeysError):
@@ -150,7 +150,7 @@ def test_a_stranger_is_turned_away_in_an_event_loop_until_allowed(
                     break
             while True:
                 with contextlib.suppress(KeysError):
-                    assert (await daemon.status()).session == guarded.daemon.session
+                    assert (await daemon.request("status"))["session"] == guarded.daemon.session
                     break
 
     asyncio.run(look())
