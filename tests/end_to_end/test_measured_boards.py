@@ -37,7 +37,7 @@ REST = 100
 """Scans at rest that come first: a daemon tares by twenty, and a controller subscribes."""
 SCALE = 0.62
 """Of the tanks' changes, as a share of the largest possible: what `evaluate measured` finds."""
-ONE_SIDED = '[instrument]\nvoltages = "positive"\nregularisation = 30.0\n'
+ONE_SIDED = '[instrument]\nvoltages = "positive"\nvolts_per_unit = 1e-3\nregularisation = 30.0\n'
 UNSIGNED = '[instrument]\nvoltages = "unsigned"\n'
 
 
@@ -78,7 +78,9 @@ def frames_of(daemon: DaemonProcess, last: int, missed: int = 0) -> dict[int, Fr
 
 
 @pytest.mark.long
-def test_presses_on_a_round_skin_are_located_through_an_openeit_board(tmp_path: Path) -> None:
+def test_presses_on_a_round_skin_are_located_through_a_board(
+    tmp_path: Path,
+) -> None:
     """As near as by `tactomo evaluate measured`, whose NOSER image comes to 5.7 mm."""
     path = described(tmp_path, "skin_round", ONE_SIDED)
     sensor = load_description(path)
@@ -91,8 +93,8 @@ def test_presses_on_a_round_skin_are_located_through_an_openeit_board(tmp_path: 
     at_rest = bare + noise * np.random.default_rng(0).standard_normal((REST, len(bare)))
     last = REST + len(presses.changes) - 1
     scans = np.vstack([at_rest, bare + presses.changes, at_rest])
-    with playing(tmp_path, scans, path, "openeit", 40.0, method="noser") as daemon:
-        frames = frames_of(daemon, last)
+    with playing(tmp_path, scans, path, "matrix", 40.0, method="noser") as daemon:
+        frames = frames_of(daemon, last, missed=1)
     came = [n for n in range(REST, last + 1) if n in frames]
     found = [frames[n].contacts for n in came]
     positions = [presses.positions_m[n - REST] for n in came]

@@ -85,11 +85,8 @@ def test_its_files_become_a_recording(newcomer: Newcomer) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("board", "x_mm", "y_mm"), [("OpenEIT", 30, -20), ("Tables", 25, 10)])
-def test_a_researcher_with_a_board_that_prints(
-    newcomer: Newcomer, board: str, x_mm: float, y_mm: float
-) -> None:
-    twin, daemon, poke, status = PAGE.commands(f"{board}, emulated")
+def test_a_researcher_with_a_board_that_prints(newcomer: Newcomer) -> None:
+    twin, daemon, poke, status = PAGE.commands("Tables, emulated")
     newcomer.follow([twin, daemon])
     wait_for_a_reference(newcomer)
     newcomer.run(poke)
@@ -99,12 +96,12 @@ def test_a_researcher_with_a_board_that_prints(
     said = newcomer.python(program.replace('"skin"', here))
     place = re.match(r"\((-?[\d.]+), (-?[\d.]+)\) mm", said)
     assert place is not None
-    assert [float(mm) for mm in place.groups()] == pytest.approx([x_mm, y_mm], abs=3)
+    assert [float(mm) for mm in place.groups()] == pytest.approx([25, 10], abs=3)
 
 
 @pytest.mark.slow
 def test_a_board_that_prints_is_described(newcomer: Newcomer) -> None:
-    for command in PAGE.commands("OpenEIT, the board") + PAGE.commands("Tables, the board"):
+    for command in PAGE.commands("Tables, the board"):
         newcomer.run(command)
         name, copied = command.split()[-2:]
         assert load_description(newcomer.folder / copied) == load_description(name)

@@ -41,12 +41,12 @@ def press(twin: Twin, x_mm: float, y_mm: float, radius_mm: float = 9.0) -> None:
 @pytest.mark.parametrize(
     ("protocol", "board", "changes"),
     [
-        ("openeit", "openeit_disc", ()),
-        pytest.param("matrix", "matrix_disc", (*WAITING, *SIXTEENTHS), marks=pytest.mark.slow),
+        ("matrix", "matrix_disc", (*WAITING, *SIXTEENTHS)),
+        pytest.param("openeit", "openeit_disc", (), marks=pytest.mark.slow),
         pytest.param("matrix", "matrix_disc", SINGLE_ENDED, marks=pytest.mark.slow),
         pytest.param("matrix", "matrix_square", (), marks=pytest.mark.slow),
     ],
-    ids=["openeit", "matrix", "single-ended", "32 electrodes"],
+    ids=["matrix", "openeit", "single-ended", "32 electrodes"],
 )
 def test_a_press_on_an_emulated_board_is_where_it_is(
     start: Start, tmp_path: Path, protocol: str, board: str, changes: tuple[tuple[str, str], ...]
@@ -65,10 +65,10 @@ def test_a_press_on_an_emulated_board_is_where_it_is(
 
 @pytest.mark.long
 def test_a_board_of_another_kind_is_refused_by_name(start: Start, tmp_path: Path) -> None:
-    board, sensor = changed(tmp_path, "openeit_disc"), changed(tmp_path, "matrix_disc")
-    _, daemon = start("openeit", board, description=sensor, protocol="matrix")
+    board, sensor = changed(tmp_path, "matrix_square"), changed(tmp_path, "matrix_disc")
+    _, daemon = start("matrix", board, description=sensor, protocol="matrix")
     [refusal] = wait_until(lambda: daemon.told("device_refused"), "a refusal")
-    said = "192 numbers a line, as of 16 electrodes (opposite drive)"
+    said = "1024 numbers a line, as of 32 electrodes"
     assert said in refusal["detail"]
     assert "description" in refusal["next_step"]
     [port] = daemon.status()["ports"]
@@ -78,8 +78,8 @@ def test_a_board_of_another_kind_is_refused_by_name(start: Start, tmp_path: Path
 
 @pytest.mark.slow
 def test_it_stands_what_happens_to_a_cable(start: Start, tmp_path: Path) -> None:
-    board = changed(tmp_path, "openeit_disc")
-    twin, daemon = start("openeit", board)
+    board = changed(tmp_path, "matrix_disc")
+    twin, daemon = start("matrix", board)
     tared(daemon)
     request("garbage", twin.control, PATIENCE_S, count=3000)
     wait_until(lambda: daemon.status()["ports"][0]["corrupt"] > 0, "damage that is counted")

@@ -56,7 +56,7 @@ from tactomo_client.messages import (
 from tactomo_client.recording import RecordingWarning
 from tactomo_client.recording import open_recording as open_frames
 from tactomo_client.schema import Event, Status
-from tactomo_models import Reference, SensorDescription, load_description, shipped_descriptions
+from tactomo_models import Reference, load_description, shipped_descriptions
 from tactomo_models.calibration.calibration_file import (
     PressureCalibration,
     parse_calibration,
@@ -157,21 +157,16 @@ def _line_examples() -> list[bytes]:
 def _parse_lines(data: bytes) -> bool:
     """Cut into reads of several lengths, the outcome is the same, also told to a new object."""
     taken = False
-    for name in ("openeit", "matrix"):
-        whole, pieces = (protocol_named(name, _described(name)) for _ in range(2))
+    for name in ("openeit_disc", "matrix_disc"):
+        whole, pieces = (protocol_named("matrix", load_description(name)) for _ in range(2))
         expected = whole.feed(data)
         step = 1 + len(data) % 7
         found = [p for n in range(0, len(data), step) for p in pieces.feed(data[n : n + step])]
         assert found == expected
         assert whole.counts == pieces.counts
-        protocol_named(name, _described(name)).feed(pieces.preamble())
+        protocol_named("matrix", load_description(name)).feed(pieces.preamble())
         taken |= bool(found)
     return taken
-
-
-@cache
-def _described(protocol: str) -> SensorDescription:
-    return load_description(f"{protocol}_disc")
 
 
 def _message_examples() -> list[bytes]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from tactomo.protocols import emulator_of, protocol_named
@@ -42,24 +40,6 @@ def test_a_frame_is_read_as_it_was_measured(protocol: str, sensor: SensorDescrip
         gain = float(scan.samples @ expected / (expected @ expected))
         assert scan.samples == pytest.approx(gain * expected, abs=1e-4 * gain * np.ptp(expected))
     assert port.counts.corrupt == 0
-
-
-@pytest.mark.parametrize(
-    ("key", "said"),
-    [(b"a\n", "mode a"), (b"b\r", "mode b"), (b"e\n", "as of 32 electrodes")],
-)
-def test_an_openeit_board_obeys_its_keys(key: bytes, said: str) -> None:
-    board, port = emulator_of("openeit")(OPENEIT, 20.0), protocol_named("openeit", OPENEIT)
-    frame: Any = Frame(np.ones(192), 0.0)
-    assert board.hear(key[:1]) == []
-    port.feed(b"\n" + b"".join(board.hear(key[1:])))
-    for _ in range(3):
-        port.feed(b"".join(board.frame(frame)))
-    assert port.trouble is not None
-    assert said in port.trouble.cause
-    [again] = port.introduction()
-    port.feed(b"".join(board.hear(again)) + b"".join(board.frame(frame)))
-    assert port.trouble is None
 
 
 def test_a_board_that_waits_is_silent_until_it_is_told() -> None:

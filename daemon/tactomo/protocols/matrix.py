@@ -10,7 +10,9 @@ commas, semicolons or white space, also at the end, after a prefix such as `magn
 leaves by; `start`, what the board waits for, if it does. There is no clock, so scans are dated by
 their arrival.
 
-Known to speak so: Teensy and AD5930 boards (lorcan2440/EIT_Touch_Sensor at 3b65e12;
+Known to speak so: OpenEIT's Spectra board (OpenEIT/EIT_Firmware, OpenEIT.c, at 38a1813), sizes of
+opposite drive after `magnitudes: `, begun by the key of its electrodes, `c` 8, `d` 16, `e` 32;
+Teensy and AD5930 boards (lorcan2440/EIT_Touch_Sensor at 3b65e12;
 knazari/eit_hybrid_state_estimation at 69ca5ea, whose builds wait for `y` or `d`), volts rms, a
 trailing comma, zeros where pairs share an electrode; the ESP32 of richgumy/black_sensor at
 11ba7e9, lines of whole tenths of a millivolt after `A`.
@@ -28,7 +30,6 @@ from tactomo_models.sensor.pattern import touching
 
 from tactomo.protocols.interface import Reading
 from tactomo.protocols.lines import LineProtocol, electrodes_of, numbers
-from tactomo.protocols.openeit import OpenEit
 
 BEGINNINGS: Final = (b"", b"A")
 ANOTHER_BOARD: Final = "give the description of the board that is connected"
@@ -41,6 +42,7 @@ class Matrix(LineProtocol):
     name = "matrix"
     device_id = "matrix"
     emulator = "tactomo.twin.boards:MatrixBoard"
+    patience_s = 10.0  # a frame of 32 electrodes takes seconds, and a key may begin it anew
 
     def __init__(self, description: SensorDescription) -> None:
         super().__init__(description)
@@ -120,9 +122,7 @@ class Matrix(LineProtocol):
 
     @classmethod
     def recognises(cls, data: bytes) -> bool:
-        """See `ForeignProtocol`: two whole lines of as many numbers, and not an OpenEIT board's."""
-        if OpenEit.recognises(data):
-            return False
+        """See `ForeignProtocol`: two whole lines of as many numbers."""
         found = Counter(
             len(values)
             for line in data.split(b"\n")[1:-1]

@@ -1,7 +1,7 @@
-"""Boards that print their readings, emulated: OpenEIT's, and those that print a table.
+"""Boards that print their readings, emulated.
 
-Each sets its gain by the first frame, so that the largest reading suits its format; as on a real
-board, what is printed is on a scale of its own.
+The gain is set by the first frame, so that the largest reading is 1; as on a real board, what is
+printed is on a scale of its own.
 """
 
 from __future__ import annotations
@@ -10,12 +10,11 @@ import numpy as np
 from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray, IntArray
 
-from tactomo.protocols.openeit import KEYS
 from tactomo.twin.foreign import Frame, Grounded
 
 
-class _Printer:
-    largest: float
+class MatrixBoard:
+    """A board that prints a table at its own pace, once it was told to; see `protocols.matrix`."""
 
     def __init__(self, description: SensorDescription, rate_hz: float) -> None:
         self.rate_hz = rate_hz  # frames a second
@@ -23,84 +22,6 @@ class _Printer:
         self._description = description
         self._gain = 0.0
         self._heard = b""
-
-    def held_up(self) -> list[bytes]:
-        """See `Emulator`: nothing."""
-        return []
-
-    def _keys(self, data: bytes) -> list[bytes]:
-        """Return the lines that the host has completed, without their ends."""
-        *lines, self._heard = (self._heard + data).replace(b"\r", b"\n").split(b"\n")
-        self._heard = self._heard[-16:]
-        return lines
-
-    def _read(self, volts: FloatArray) -> FloatArray:
-        if not self._gain:
-            self._gain = self.largest / float(np.abs(volts).max())
-        read = volts * self._gain
-        return read if self._description.instrument.voltages == "signed" else np.abs(read)
-
-
-class OpenEitBoard(_Printer):
-    """A Spectra board, which images from power-up on; see `protocols.openeit`."""
-
-    largest = 4096.0
-
-    def __init__(self, description: SensorDescription, rate_hz: float) -> None:
-        super().__init__(description, rate_hz)
-        self._own_key = KEYS[description.electrode_count].strip()
-        self._mode = b"d"
-
-    def greeting(self) -> list[bytes]:
-        """See `Emulator`."""
-        self.is_streaming = True
-        menu = b"Press:\n a for Time-Series,\n b for Bioimpedance Spectroscopy,\n"
-        keys = b" c, d, e for Imaging with 8, 16, 32 electrodes, followed by return key.\n"
-        stars = b"*******************\n"
-        return [b"\n" + stars + b"OpenEIT:\n" + menu + keys + stars]
-
-    def hear(self, data: bytes) -> list[bytes]:
-        """See `Emulator`."""
-        answers = []
-        for key in self._keys(data):
-            if key in _MODES and key != self._mode:
-                self._mode = key
-                answers.append(_MODES[key])
-        return answers
-
-    def frame(self, frame: Frame) -> list[bytes]:
-        """See `Emulator`."""
-        volts = self._read(frame.volts)
-        if self._mode == b"a":
-            return [_fixed(volts[0]) + b" \r\n"]
-        if self._mode == b"b":
-            return [b"magnitudes:%d;%s \r\n" % (f, _fixed(volts[0])) for f in (200, 500, 800)]
-        if self._mode != self._own_key:  # no electrodes where it looks for them: zeros
-            count = next(n for n, key in KEYS.items() if key.strip() == self._mode)
-            volts = np.zeros(count * (count - 4))
-        return [b"magnitudes: " + b"".join(_fixed(v) + b"," for v in volts) + b"\r\n"]
-
-
-_MODES = {
-    b"a": b"mode 1: time series\n",
-    b"b": b"mode 2: bioimpedance spectroscopy\n",
-    **{key.strip(): b"mode 3: imaging\n" for key in KEYS.values()},
-}
-
-
-def _fixed(value: float) -> bytes:
-    """A number in the firmware's fixed-point format: sixteenths, printed as %8d.%04d."""
-    whole, sixteenths = divmod(round(float(value) * 16), 16)
-    return b"%8d.%04d" % (whole, sixteenths * 625)
-
-
-class MatrixBoard(_Printer):
-    """A board that prints a table at its own pace, once it was told to; see `protocols.matrix`."""
-
-    largest = 1.0
-
-    def __init__(self, description: SensorDescription, rate_hz: float) -> None:
-        super().__init__(description, rate_hz)
         pairs = description.pairs
         self._place = (
             _numbered(description.drive_pairs, pairs.drive),
@@ -109,6 +30,10 @@ class MatrixBoard(_Printer):
         self._grounded = Grounded(description)
         self._start = description.instrument.start.encode()
         self._is_single_ended = description.instrument.referenced == "single_ended"
+
+    def held_up(self) -> list[bytes]:
+        """See `Emulator`: nothing."""
+        return []
 
     def greeting(self) -> list[bytes]:
         """See `Emulator`."""
@@ -135,6 +60,12 @@ class MatrixBoard(_Printer):
         table = np.zeros((drives, pairs))
         table[self._place] = self._read(frame.volts)
         return table
+
+    def _read(self, volts: FloatArray) -> FloatArray:
+        if not self._gain:
+            self._gain = 1.0 / float(np.abs(volts).max())
+        read = volts * self._gain
+        return read if self._description.instrument.voltages == "signed" else np.abs(read)
 
 
 def _numbered(listed: IntArray, pairs: IntArray) -> IntArray:

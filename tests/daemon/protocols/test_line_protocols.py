@@ -14,7 +14,6 @@ from tactomo.errors import ConfigError
 from tactomo.protocols import ForeignProtocol, protocol_named, recognised
 from tactomo.protocols.lines import MAX_LINE_BYTES
 from tactomo.protocols.matrix import Matrix
-from tactomo.protocols.openeit import OpenEit
 from tactomo_models import SensorDescription, load_description
 from tactomo_models.arrays import FloatArray
 from tactomo_models.errors import DescriptionError
@@ -56,8 +55,8 @@ def begun(protocol: ForeignProtocol) -> ForeignProtocol:
     return protocol
 
 
-def fed(data: bytes, kind: type[ForeignProtocol] = Matrix, **changes: Any) -> ForeignProtocol:
-    protocol = begun(kind(variant(OPENEIT if kind is OpenEit else MATRIX, **changes)))
+def fed(data: bytes, **changes: Any) -> ForeignProtocol:
+    protocol = begun(Matrix(variant(MATRIX, **changes)))
     protocol.feed(data)
     return protocol
 
@@ -66,7 +65,7 @@ def fed(data: bytes, kind: type[ForeignProtocol] = Matrix, **changes: Any) -> Fo
 @settings(max_examples=30)
 def test_an_openeit_frame_comes_whole_in_any_chunking(cuts: list[int]) -> None:
     stream = BANNER + openeit_line(VALUES[:192]) + b"Imaging\n" + openeit_line(VALUES[1:193])
-    protocol, packets = OpenEit(OPENEIT), []
+    protocol, packets = Matrix(OPENEIT), []
     for cut in [*cuts, len(stream)]:
         packets += protocol.feed(stream[:cut])
         stream = stream[cut:]
@@ -79,21 +78,9 @@ def test_an_openeit_frame_comes_whole_in_any_chunking(cuts: list[int]) -> None:
     assert protocol.trouble is None
 
 
-@pytest.mark.parametrize(
-    ("electrodes", "key", "values"), [(8, b"c\n", 32), (16, b"d\n", 192), (32, b"e\n", 896)]
-)
-def test_openeit_is_told_the_electrodes(electrodes: int, key: bytes, values: int) -> None:
-    sensor = variant(
-        OPENEIT, electrodes={"count": electrodes}, pattern={"drive_offset": electrodes // 2}
-    )
-    protocol = begun(OpenEit(sensor))
-    assert protocol.introduction() == [key]
-    line = openeit_line(np.ones(values))
-    assert scans(protocol.feed(line)) == [[1.0] * values]
-
-
 def test_a_build_with_a_menu_is_told_what_the_description_says() -> None:
-    assert OpenEit(variant(OPENEIT, instrument={"start": "c\r"})).introduction() == [b"c\r"]
+    assert Matrix(OPENEIT).introduction() == [b"d\n"]
+    assert Matrix(variant(OPENEIT, instrument={"start": "c\r"})).introduction() == [b"c\r"]
     assert Matrix(variant(MATRIX, instrument={"start": "y"})).introduction() == [b"y"]
     assert Matrix(MATRIX).introduction() == []
 
@@ -101,13 +88,14 @@ def test_a_build_with_a_menu_is_told_what_the_description_says() -> None:
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        (b"    1250.0625 \r\n", "mode a, a time series"),
-        (b"magnitudes:200;    1250.0625 \r\n", "mode b, a spectrum"),
+        (b"    1250.0625 \r\n", "1 numbers a line; the description openeit_disc"),  # mode a
+        (b"magnitudes:200;    1250.0625 \r\n", "2 numbers a line"),  # mode b
         (openeit_line(np.ones(896)), "896 numbers a line, as of 32 electrodes (opposite drive)"),
     ],
 )
-def test_openeit_in_another_mode_is_named(line: bytes, said: str) -> None:
-    protocol = fed(line * 2, OpenEit)
+def test_openeit_in_another_mode_is_refused(line: bytes, said: str) -> None:
+    protocol = begun(Matrix(OPENEIT))
+    protocol.feed(line * 2)
     assert protocol.trouble is None  # it may be damage
     protocol.feed(line)
     assert protocol.trouble is not None
@@ -201,7 +189,7 @@ def test_another_boards_table_is_named(line: bytes, said: str) -> None:
 )
 def test_a_damaged_line_costs_itself(line: bytes) -> None:
     whole = openeit_line(VALUES[:192])
-    protocol = begun(OpenEit(OPENEIT))
+    protocol = begun(Matrix(OPENEIT))
     assert len(scans(protocol.feed(whole + line + whole))) == 2
     assert (protocol.counts.damaged, protocol.counts.faulty) == (1, 0)
     assert protocol.trouble is None
@@ -236,24 +224,22 @@ def test_a_recording_may_begin_anywhere(data: st.DataObject) -> None:
         assert scans(after) == scans(expected)[len(expected) - len(found) :]  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("kind", [OpenEit, Matrix])
-def test_a_new_cable_does_not_finish_the_old_line(kind: type[ForeignProtocol]) -> None:
-    sensor = OPENEIT if kind is OpenEit else MATRIX
-    line = (openeit_line if kind is OpenEit else teensy_line)(VALUES[: sensor.measurements])
-    protocol = begun(kind(sensor))
+def test_a_new_cable_does_not_finish_the_old_line() -> None:
+    line = teensy_line(VALUES[:208])
+    protocol = begun(Matrix(MATRIX))
     protocol.feed(line + line[:500])
     protocol.restart()
     assert protocol.begun() == b""
     hello, scan = protocol.feed(line[500:] + line)
     assert hello == protocol.hello()  # for the port: who is there now is the same
-    assert scans([scan]) == [VALUES[: sensor.measurements].tolist()]
+    assert scans([scan]) == [VALUES[:208].tolist()]
     assert isinstance(scan, Scan)
     assert scan.counter == 1
     assert protocol.counts.corrupt == 0
 
 
 def test_ports_are_recognised_by_what_they_print() -> None:
-    assert recognised(openeit_line(VALUES[:192])[300:] + openeit_line(VALUES[:192])) == "openeit"
+    assert recognised(openeit_line(VALUES[:192])[300:] + openeit_line(VALUES[:192]) * 2) == "matrix"
     assert recognised(teensy_line(np.ones(256)) * 4) == "matrix"
     assert recognised(b"x" + teensy_line(np.ones(16)) * 4) == "matrix"
     assert recognised(b"temperature 1\ntemperature 2\n") is None
@@ -263,8 +249,6 @@ def test_ports_are_recognised_by_what_they_print() -> None:
 @pytest.mark.parametrize(
     ("protocol", "sensor", "said"),
     [
-        ("openeit", MATRIX, "drives opposite ones"),
-        ("openeit", load_description("skin_round"), "sizes alone"),
         ("matrix", load_description("paper_square"), "two channels"),
         ("matrix", variant(SQUARE, electrodes={"per_side": 9}), "1188 voltages, and a scan at"),
     ],
