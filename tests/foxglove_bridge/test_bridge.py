@@ -31,7 +31,7 @@ from waiting import PATIENCE_S, repeated
 
 PRESSED = 50
 DESCRIPTION = description_fields(load_description("paper_square"))
-ALL = {"sheet", "contacts", "surface", "grid", "image", "annotations", "frame", "health", "events"}
+ALL = {"sheet", "contacts", "surface", "grid", "frame", "health", "events"}
 STATUS: Mapping[str, Any] = {
     "issues": [{"severity": "error", "what": "it hums", "next_step": "oil it"}],
     "state": "running",
@@ -211,19 +211,6 @@ def test_the_grid_has_the_numbers_and_lies_where_the_map_is(client: FoxgloveClie
     assert grid.pose.position.x + grid.cell_size.x / 2 == pytest.approx(-0.075)
     assert grid.cell_size.y == pytest.approx(0.003)
     assert (cells["alpha"] == 255).all()
-
-
-def test_the_image_has_y_up_and_its_labels_lie_on_it(client: FoxgloveClient) -> None:
-    firm = contacts_of(PRESSED)[0]
-    image = client.wait("/left/image")
-    pixels = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
-    brightest = np.argwhere(pixels.sum(axis=-1) == pixels.sum(axis=-1).max()).mean(axis=0)
-    marks = client.wait("/left/annotations")
-    circle = marks.circles[0]
-    assert (circle.position.y - 0.5, circle.position.x - 0.5) == pytest.approx(brightest, abs=1.0)
-    assert circle.position.y > image.height / 2  # below the middle, as it was pressed
-    assert circle.position.x == pytest.approx((firm.x_mm + 75) / 3 + 0.5)
-    assert "kPa" in marks.texts[0].text
 
 
 def test_numbers_to_plot_and_what_the_daemon_finds_wrong(

@@ -11,7 +11,7 @@ import pytest
 from tactomo_foxglove import layout_for, shipped_layout
 from tactomo_foxglove.topics import FRAME_SCHEMA, HEALTH_SCHEMA
 
-TOPICS = {"sheet", "contacts", "grid", "image", "annotations", "frame", "health", "events"}
+TOPICS = {"sheet", "contacts", "grid", "frame", "health", "events"}
 SCHEMAS = {"frame": FRAME_SCHEMA, "health": HEALTH_SCHEMA}
 
 
@@ -40,7 +40,7 @@ def test_every_panel_has_a_configuration() -> None:
     layout = json.loads(shipped_layout())
     assert sorted(panels(layout["layout"])) == sorted(layout["configById"])
     kinds = {name.partition("!")[0] for name in layout["configById"]}
-    assert {"3D", "Image", "Plot", "RosOut"} <= kinds
+    assert {"3D", "Plot", "RosOut"} <= kinds
 
 
 def test_it_names_no_topic_and_no_field_that_there_is_not() -> None:

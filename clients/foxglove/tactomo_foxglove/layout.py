@@ -1,4 +1,4 @@
-"""The layout that shows a sensor: 3D, Image, Plot and Log panels."""
+"""The layout that shows a sensor: 3D, Plot and Log panels."""
 
 from __future__ import annotations
 

@@ -148,61 +148,6 @@ def _fields(cells: np.dtype[Any]) -> list[fox.PackedElementField]:
     ]
 
 
-def image(frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str) -> Any:
-    """Return the map as a picture for the Image panel, y up; None for a frame without images."""
-    pixels = appearance.map_pixels(frame, description)
-    if pixels is None:
-        return None
-    rows, columns, _ = pixels.shape
-    return fox.RawImage(
-        timestamp=to_timestamp(time_ns),
-        frame_id=frame.sensor,
-        width=columns,
-        height=rows,
-        encoding="rgb8",
-        step=3 * columns,
-        data=np.flipud(_faded(pixels, stale)).tobytes(),
-    )
-
-
-def image_annotations(
-    frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str
-) -> fox.ImageAnnotations | None:
-    """Return the contacts as circles and labels on that picture."""
-    shown = appearance.shown_image(frame, description)
-    if shown is None or frame.x_mm is None or frame.y_mm is None:
-        return None
-    at = to_timestamp(time_ns)
-    colour = GREY if stale else WHITE
-    step_mm = (frame.x_mm[1] - frame.x_mm[0]) / (shown[0].shape[1] - 1)
-    circles, texts = [], []
-    for contact in frame.contacts:
-        x = (contact.x_mm - frame.x_mm[0]) / step_mm + 0.5
-        y = (frame.y_mm[1] - contact.y_mm) / step_mm + 0.5
-        diameter = contact_diameter_mm(contact) / step_mm
-        circles.append(
-            fox.CircleAnnotation(
-                timestamp=at,
-                position=fox.Point2(x=x, y=y),
-                diameter=diameter,
-                thickness=0.3,
-                outline_color=colour,
-                metadata=_metadata(contact),
-            )
-        )
-        texts.append(
-            fox.TextAnnotation(
-                timestamp=at,
-                position=fox.Point2(x=x - diameter / 2, y=y - diameter / 2 - 0.5),
-                text=label(contact),
-                font_size=2.2,
-                text_color=colour,
-                background_color=fox.Color(r=0.0, g=0.0, b=0.0, a=0.5),
-            )
-        )
-    return fox.ImageAnnotations(timestamp=at, circles=circles, texts=texts)
-
-
 def contacts_scene(
     frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str
 ) -> fox.SceneUpdate:

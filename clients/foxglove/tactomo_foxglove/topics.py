@@ -107,8 +107,6 @@ class SensorTopics:
         self._contacts = channels.SceneUpdateChannel(topic("contacts"), context=context)
         self._surface = channels.SceneUpdateChannel(topic("surface"), context=context)
         self._grid = channels.GridChannel(topic("grid"), context=context)
-        self._image = channels.RawImageChannel(topic("image"), context=context)
-        self._annotations = channels.ImageAnnotationsChannel(topic("annotations"), context=context)
         self._frame = foxglove.Channel(topic("frame"), schema=FRAME_SCHEMA, context=context)
         self._health = foxglove.Channel(topic("health"), schema=HEALTH_SCHEMA, context=context)
         self._events = channels.LogChannel(topic("events"), context=context)
@@ -153,8 +151,6 @@ class SensorTopics:
             (self._contacts, messages.contacts_scene),
             (self._surface, messages.surface),
             (self._grid, messages.grid),
-            (self._image, messages.image),
-            (self._annotations, messages.image_annotations),
         )
         for channel, draw in drawings:
             if channel.has_sinks() and (drawn := draw(frame, self.description, time_ns, stale)):

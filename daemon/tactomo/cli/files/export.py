@@ -88,7 +88,7 @@ def export(
 ) -> None:
     """Write the frames of a recording in a format of other programs, by the extension of OUT.
 
-    *.mcap* opens in Foxglove: 3D, Image and Plot panels show what `tactomo foxglove` shows live.
+    *.mcap* opens in Foxglove: 3D and Plot panels show what `tactomo foxglove` shows live.
     Needs foxglove-sdk: `pip install 'tactomo[foxglove]'`.
 
     *--ros2* writes a folder for `ros2 bag play`: maps and contacts as PointCloud2, WrenchStamped

@@ -1,4 +1,4 @@
-"""`tactomo foxglove`: a running sensor in Foxglove's 3D, Image, Plot and Log panels."""
+"""`tactomo foxglove`: a running sensor in Foxglove's 3D, Plot and Log panels."""
 
 from __future__ import annotations
 
