@@ -27,6 +27,8 @@ default_role = "code"  # `name` in docstrings
 html_theme = "furo"  # nothing of it comes from elsewhere, fonts neither
 html_title = f"tactomo {release}"
 templates_path = ["_templates"]
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_copy_source = html_show_sourcelink = html_show_copyright = False
 
 

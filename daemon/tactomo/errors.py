@@ -29,7 +29,8 @@ def needs(what: str, install: str) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        raise TactomoError(f"{what} needs {error.name}, which is not installed", install) from error
+        step = f"{install}, or `make setup` in a checkout" if "'tactomo[" in install else install
+        raise TactomoError(f"{what} needs {error.name}, which is not installed", step) from error
 
 
 @contextmanager

@@ -145,11 +145,6 @@ def _kind(output: Path) -> str:
 
 
 def _writer(kind: str) -> Writer:
-    from tactomo_client.filled import filled
-    from tactomo_client.schema import Mount
-
-    from tactomo.imaging.frames import description_fields
-
     if kind == ".csv":
         from tactomo.cli.files.csv import write_contacts
 
@@ -159,19 +154,28 @@ def _writer(kind: str) -> Writer:
             from tactomo_foxglove import write_mcap
 
         def write(frames: RecordedFrames, moments: Moments, file: IO[bytes]) -> int:
-            about = {} if frames.description is None else description_fields(frames.description)
-            return write_mcap(_timed(frames, moments), file, frames.sensor, about)
+            return write_mcap(_timed(frames, moments), file, frames.sensor, _about(frames))
 
         return write
     with needs("a ROS 2 bag", "pip install 'tactomo[ros2]'"):
         from tactomo_ros2.bag import write_bag
 
     def write_folder(frames: RecordedFrames, moments: Moments, folder: Path) -> int:
-        about = {} if frames.description is None else description_fields(frames.description)
+        from tactomo_client.filled import filled
+        from tactomo_client.schema import Mount
+
+        about = _about(frames)
         mount = filled(Mount, about["mount"]) if about.get("mount") else None
         return write_bag(_timed(frames, moments), folder, frames.sensor, mount)
 
     return write_folder
+
+
+def _about(frames: RecordedFrames) -> dict[str, Any]:
+    """What a status says of the sensor."""
+    from tactomo.imaging.frames import description_fields
+
+    return {} if frames.description is None else description_fields(frames.description)
 
 
 def _dataset_writer(

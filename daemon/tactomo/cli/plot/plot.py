@@ -106,7 +106,7 @@ def prepare_picture(output: Path, *, force: bool = True) -> None:
     next_step = "give a .png, .svg or .pdf in a folder that you may write"
     if output.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise TactomoError(f"cannot write {output}: not a kind of picture", next_step)
-    with needs("drawing", "pip install 'tactomo[plot]', or `make setup` in a checkout"):
+    with needs("drawing", "pip install 'tactomo[plot]'"):
         import matplotlib
     matplotlib.use("Agg")
     prepare_file(output, force=force)

@@ -47,9 +47,8 @@ def tare(
     say(f"new reference from {taken.scans} dual scans")
     if taken.contacts:
         say(
-            f"shown meanwhile: {counted(taken.contacts, 'contact')}, which now count as nothing "
-            "pressed; "
-            "if something was on the skin, take it off and tare again",
+            f"shown meanwhile: {counted(taken.contacts, 'contact')}. If something was on the skin, "
+            "it now counts as nothing pressed: take it off and tare again",
             err=True,
         )
 
