@@ -8,7 +8,7 @@ Run, in this folder, to reconstruct a file, or to draw the method on the chart b
 import numpy as np
 from tactomo_models import Channel, Estimate, Measurement, Skin, UnsolvableError
 
-TYPICAL_CHANGE = 0.3  # of the magnitude channel's conductivity, where the structure channel answers
+TYPICAL_CHANGE = 0.3  # of the magnitude channel's conductivity, where structure answers
 BACKGROUND = 1e-6  # share of the prior variance that the rest of the sheet keeps
 
 

@@ -184,9 +184,9 @@ def _refusal(event: int, address: str, keys: Keys | None) -> KeysError:
     if event == zmq.Event.HANDSHAKE_FAILED_AUTH and keys is not None:
         return KeysError(
             f"{address} does not let this client in: its key {keys.public.decode()} is not allowed",
-            f"copy {keys.name}{PUBLIC_SUFFIX} to the server's computer, and there run `tactomo "
-            f"keys allow {keys.name}{PUBLIC_SUFFIX} --for {keys.server_name}`, for its control "
-            "socket with `--may-command`, and with `--keys FOLDER` where they are elsewhere",
+            f"copy {keys.name}{PUBLIC_SUFFIX} to the server's computer, and run there `tactomo "
+            f"keys allow {keys.name}{PUBLIC_SUFFIX} --for {keys.server_name}`; commands need "
+            "`--may-command`, keys in another folder `--keys FOLDER`",
             "key_refused",
         )
     if keys is None:

@@ -112,8 +112,8 @@ class Scans:
             return None
         if not len(volts[frames]):
             raise ImportFileError(
-                f"the reference frames are 0 of the {len(volts)} scans",
-                "give some, such as --reference-frames 0:20",
+                f"the reference frames are none of the {len(volts)} scans",
+                "name some that are there, such as --reference-frames 0:20",
             )
         return volts[frames]
 

@@ -198,7 +198,7 @@ def test_readings_of_companions_are_kept(tactomo: Run, tmp_path: Path) -> None:
         (
             {"injection": INJECTION, "volts": potentials(2)},
             ["--rate", "1", "--description", "tank_disc", "--reference-frames", "5:9"],
-            "the reference frames are 0 of the 2 scans",
+            "the reference frames are none of the 2 scans",
         ),
     ],
 )

@@ -154,7 +154,7 @@ def _up_to_first_map(moments: Iterator[Moment]) -> Iterator[Moment]:
         if _image(moment) is not None:
             return
     raise TactomoError(
-        "no frame has a map, so that a dataset's shape is not known",
+        "no frame has a map, so the dataset's shape is unknown",
         "look at it with `tactomo info`; record with the skin tared, and with --maps",
     )
 
