@@ -31,6 +31,7 @@ from tactomo_models.scene.pressure_field import PressureField
 PATIENCE_S = 1.0  # of work on data that no field explains, before a drift is tried
 EXPLAINED = 1.4  # misfit of the worst sheet, below which a drift beside a field is believed
 MAX_DRIFT = 0.2  # of a sheet's voltages, 10 K at 2 % per kelvin: more is a fault
+WRONG = 1e-3  # how likely it is, beforehand, that companions read what they like
 MAX_HELD = 10  # frames without a structure scan that the last field stands in for: 0.5 s
 
 
@@ -43,8 +44,9 @@ class Course:
     unexplained_s: float = 0.0  # of work on data that no field has explained yet
     frames_held: int = 0  # since the last structure scan
     account: FieldAccount | None = None  # of the belief
-    # what is wrong with each companion that contradicts the sheets, in words
-    disputed: Mapping[str, str] = field(default_factory=dict)
+    # companions that the sheets were asked about, and those that they then made unlikely
+    believed: frozenset[str] = frozenset()
+    disputed: Mapping[str, CompanionForce] = field(default_factory=dict)
 
     @property
     def at_rest(self) -> Course | None:
@@ -141,35 +143,41 @@ class Fit:
     ) -> tuple[Course, Measurement]:
         """The same as `_followed`, without the companions that contradict the sheets.
 
-        Companions are fitted beside the sheets first. Where that explains all data, nothing
-        contradicts. Else the sheets are fitted alone, from a cold start, and the frame may take as
-        long again.
+        Companions are fitted beside the sheets first. Now and then, and where that does not explain
+        all data, the sheets are fitted alone, from a cold start; the frame may take as long again.
         """
         companions = measurement.companions
         if not companions:
             return self._followed(course, measurement, Budget(budget_s))
-        kept = {name: one for name, one in companions.items() if name not in course.disputed}
+        disputed = {
+            name: before
+            for name, before in course.disputed.items()
+            if name in companions and _stays(before, companions[name], course.belief)
+        }
+        kept = {name: one for name, one in companions.items() if name not in disputed}
         fitted, judged = self._followed(
             course, replace(measurement, companions=kept), Budget(budget_s)
         )
         assert fitted.belief is not None
-        felt = self._forces(fitted.belief, companions)
-        contradicted = {k for k, one in kept.items() if not one.agrees_with(felt[k][0])}
-        if kept and fitted.belief.done and (contradicted or not fitted.belief.is_explained):
+        felt = self._forces(fitted.belief, kept)
+        is_doubtful = not fitted.belief.is_explained or _is_new(fitted.belief)
+        is_doubtful |= not all(one.agrees_with(felt[name][0]) for name, one in kept.items())
+        believed = course.believed & kept.keys()
+        if kept and fitted.belief.done and (is_doubtful or kept.keys() - believed):
             alone, sheets = self._followed(
                 Course(drifts=course.drifts), replace(measurement, companions={}), Budget(budget_s)
             )
             assert alone.belief is not None
-            told = self._forces(alone.belief, companions)
-            if not all(companions[name].agrees_with(*told[name]) for name in kept):
-                fitted, judged, felt = alone, sheets, told
-        disputed = {
-            name: f"companion {name} reads {one.force_n:.3g} N where the sheets say "
-            f"{felt[name][0]:.3g} N: left out"
-            for name, one in companions.items()
-            if name not in judged.companions and not one.agrees_with(*felt[name])
-        }
-        return replace(fitted, disputed=disputed), judged
+            told = self._forces(alone.belief, kept)
+            wrong = {k: one for k, one in kept.items() if not one.agrees_with(*told[k])}
+            if not wrong and _are_unlikely(kept, fitted.belief, alone.belief):
+                wrong = kept
+            believed = frozenset(kept.keys() - wrong.keys())
+            if wrong:
+                fitted, judged, disputed = alone, sheets, disputed | wrong
+        else:  # whoever was disputed stays so until the sheets are asked
+            disputed |= {k: one for k, one in course.disputed.items() if k in kept}
+        return replace(fitted, believed=believed, disputed=disputed), judged
 
     def _forces(
         self, belief: Belief, companions: Mapping[str, CompanionForce]
@@ -236,6 +244,12 @@ class Fit:
             flags |= Flag.MISFIT_HIGH
         if course.disputed:
             flags |= Flag.COMPANION_DISPUTED
+        felt = self._forces(belief, course.disputed)
+        disputes = [
+            f"companion {name} reads {one.force_n:.3g} N where the sheets say "
+            f"{felt[name][0]:.3g} N: left out"
+            for name, one in course.disputed.items()
+        ]
         how = belief.how + (", drifted since the tare" if course.drifts else "")
         return Estimate(
             map=account.map if Channel.MAGNITUDE in measurement.changes else None,
@@ -248,7 +262,7 @@ class Fit:
             misfit=fitted.misfit,
             flags=flags,
             made_by="fit",
-            reason="; ".join([f"{how}, {_in_words(belief)}", *course.disputed.values()]),
+            reason="; ".join([f"{how}, {_in_words(belief)}", *disputes]),
             companions=dict.fromkeys(measurement.companions, True)
             | dict.fromkeys(course.disputed, False),
             carried=course,
@@ -289,6 +303,29 @@ class Fit:
         held = self._field_fit.evaluate(family, parameters, last.log_ratio, measurement.data)
         steps = 3  # pressures alone are nearly linear
         return self._field_fit.refine(held, measurement.data, Budget(1.0), 0.0, steps)
+
+
+def _is_new(belief: Belief | None) -> bool:
+    """Whether something moved in the frame that this came of: rarely, of many such frames."""
+    return belief is None or (belief.how != "still" and not belief.frames & (belief.frames - 1))
+
+
+def _stays(before: CompanionForce, now: CompanionForce, belief: Belief | None) -> bool:
+    """Whether a disputed companion stays left out, as long as nothing is new."""
+    if belief is None or _is_new(belief):
+        return False
+    return belief.how != "still" or now.agrees_with(before.force_n, before.sigma_n)
+
+
+def _are_unlikely(companions: Mapping[str, CompanionForce], beside: Belief, alone: Belief) -> bool:
+    """Whether it is likelier that companions are wrong than that their forces are what presses.
+
+    By the evidence of all data over that of the sheets alone, which is the density of the readings
+    as the sheets predict them. One that is wrong may read any force of that size.
+    """
+    sigmas = [one.sigma_n / max(abs(one.force_n), one.sigma_n) for one in companions.values()]
+    foreseen = beside.account.log_evidence - alone.account.log_evidence
+    return bool(foreseen - np.log(sigmas).sum() < np.log(WRONG))
 
 
 def _in_words(belief: Belief) -> str:

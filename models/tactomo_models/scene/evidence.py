@@ -24,7 +24,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtri, gammaln
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
@@ -56,8 +56,10 @@ class Likelihood:
         return float(own @ own)
 
     def log(self, chi_squared: float) -> float:
-        """Logarithm of the likelihood, but for a constant."""
-        return -self.count * float(np.log(self.count + chi_squared))
+        """Logarithm of the likelihood, of whitened data: comparable with that of more of them."""
+        n = self.count
+        scale = gammaln(n) - gammaln(n / 2) + n / 2 * np.log(n / np.pi)
+        return float(scale - n * np.log(n + chi_squared))
 
     def precision(self, chi_squared: float) -> float:
         """Factor on the errors' inverse variance that is likely where this much is left."""

@@ -76,7 +76,7 @@ def test_a_force_is_surer_with_a_load_cell(reconstructor: Reconstructor, scan: F
     assert both.force_sigma_n < 0.01 * BALL_N
 
 
-@pytest.mark.parametrize("factor", [0.0, 3.0])
+@pytest.mark.parametrize("factor", [0.0, 2.0, 3.0])
 def test_a_load_cell_that_contradicts_the_sheet_is_named_and_left_out(
     reconstructor: Reconstructor, scan: FloatArray, factor: float
 ) -> None:
@@ -87,6 +87,25 @@ def test_a_load_cell_that_contradicts_the_sheet_is_named_and_left_out(
     assert wrong.force_n == pytest.approx(alone.force_n, rel=1e-6)
     again = reconstructor.reconstruct(scan, None, companions=[("load_cell", BALL_N / 2 + 5)])
     assert not again.flags & Flag.COMPANION_DISPUTED  # it is believed once it agrees
+
+
+@pytest.mark.parametrize(("factor", "is_believed"), [(0.6, False), (1.0, True), (2.0, False)])
+def test_a_force_that_the_sheet_makes_unlikely_is_left_out_until_it_is_likely(
+    reconstructor: Reconstructor, skin: Skin, factor: float, is_believed: bool
+) -> None:
+    """What a sheet allows with a shape of its own, it allows of most forces: the evidence tells."""
+    small = Press(0.03, 0.03, 280.0, 0.008)
+    force_n = 280e3 * np.pi * 0.008**2
+    frames = []
+    reconstructor.reset()
+    for times in (*[factor] * 4, 1.0, 1.0):
+        scan = skin.scan(small)["magnitude"]
+        reading = ("load_cell", times * force_n / 2 + 5)
+        frames.append(reconstructor.reconstruct(scan, None, companions=[reading]))
+    disputed = [Flag.COMPANION_DISPUTED in frame.flags for frame in frames]
+    assert disputed[:4] == [not is_believed] * 4
+    assert not disputed[5]
+    assert frames[5].companions["load_cell"].state == "fitted"
 
 
 @pytest.mark.parametrize("reading", [np.nan, 400.5, -0.1])
