@@ -29,7 +29,7 @@ export function showContacts(contacts, unit) {
     Object.assign(row.dataset, { id: contact.id, xMm: contact.x_mm, yMm: contact.y_mm });
     const id = row.cells[0].firstChild;
     setText(id, String(contact.id));
-    id.ariaLabel = `Mark contact ${contact.id} on the map`;
+    Object.assign(id, { ariaLabel: `Contact ${contact.id}`, title: "Mark on the map" });
     id.style.background = contactColour(contact.id);
     const touched = contact.pressure_range === "below" ? "touched" : "–";
     const texts = [
