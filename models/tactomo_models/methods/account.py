@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from tactomo_protocol import Channel
@@ -162,12 +162,26 @@ def hardly_pressed(
 
 
 def descended(
-    fit: FieldFit, account: Account, frame: Frame, steps: int, *, holds_ratio: bool = False
+    fit: FieldFit,
+    account: Account,
+    frame: Frame,
+    steps: int,
+    *,
+    holds_ratio: bool = False,
+    stays_light: bool = False,
 ) -> Account:
     """An account nearer to its minimum, by Levenberg-Marquardt on all sheets at once.
 
     It is there when no more than `NEGLIGIBLE` is left to gain, as its own Jacobian predicts that.
     What was begun is finished: a budget is looked at between fits, never within one.
+
+    Args:
+        fit: what fits fields to the sheets.
+        account: where to begin.
+        frame: what is fitted to.
+        steps: no more than these.
+        holds_ratio: whether the structure sheet's ratio stays as it is.
+        stays_light: whether what presses too lightly for the graded sheet still does.
     """
     for _ in range(steps):
         fitted = account.fitted
@@ -177,7 +191,7 @@ def descended(
             normal[-1, -1] = 1.0
         if predicted_gain(normal, gradient) * account.unit < NEGLIGIBLE:
             return replace(account, at_minimum=True)
-        better = _stepped(fit, account, normal, gradient, frame)
+        better = _stepped(fit, account, normal, gradient, frame, stays_light)
         if better is None:
             return replace(account, at_minimum=True)
         frame.budget.spend(better)
@@ -189,29 +203,32 @@ def descended(
 
 
 def _stepped(
-    fit: FieldFit, account: Account, normal: FloatArray, gradient: FloatArray, frame: Frame
+    fit: FieldFit,
+    account: Account,
+    normal: FloatArray,
+    gradient: FloatArray,
+    frame: Frame,
+    stays_light: bool,
 ) -> FittedField | None:
     """The field after a step downhill; None where none is worth a solve."""
     fitted = account.fitted
-    limited = partial(limited_step, fit, fitted)
-    scale, _ = account.prior
+    family, scale = account.family, account.prior[0]
+
+    def limited(step: FloatArray) -> FloatArray:
+        parameters = family.bounded(fitted.parameters + step[:-1])
+        if stays_light:
+            parameters = family.as_light(parameters, fitted.parameters)
+        ratio = fit.bounded_ratio(fitted.log_ratio + float(step[-1]))
+        return np.append(parameters - fitted.parameters, ratio - fitted.log_ratio)
+
     steps = damped_steps(normal, gradient, scale, fitted.damping, limited, account.unit)
     for step, damping in steps:
         parameters, ratio = fitted.parameters + step[:-1], fitted.log_ratio + float(step[-1])
-        trial = fit.evaluate(fitted.family, parameters, ratio, frame.measured)
+        trial = fit.evaluate(family, parameters, ratio, frame.measured)
         frame.budget.spend(trial)
         if trial.cost < fitted.cost:
             return replace(trial, damping=max(damping / 5, 1e-3))
     return None
-
-
-def limited_step(fit: FieldFit, fitted: FittedField, step: FloatArray) -> FloatArray:
-    """A step (N,), or (N + 1,) with the log ratio, cut where a parameter or that has its limit."""
-    count = len(fitted.parameters)
-    parameters = fitted.family.bounded(fitted.parameters + step[:count])
-    ratio = fit.bounded_ratio(fitted.log_ratio + float(step[count:].sum()))
-    off = np.append(parameters - fitted.parameters, ratio - fitted.log_ratio)
-    return off[: len(step)]
 
 
 def damped_steps(

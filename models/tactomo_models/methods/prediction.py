@@ -22,12 +22,12 @@ from tactomo_models.methods.account import Account, Frame, laplace
 from tactomo_models.methods.kinds import Kind, as_kind
 from tactomo_models.scene.drawing import Drawing
 from tactomo_models.scene.field_fit import FieldFit, Step
-from tactomo_models.scene.parameters import PEAK
-from tactomo_models.scene.pressure_field import PressureField
+from tactomo_models.scene.parameters import EDGE, HOLE, PEAK
+from tactomo_models.scene.pressure_field import BELOW, PressureField
 from tactomo_models.scene.sheet_response import GradedResponse
 
-BELOW = 1 - 1e-9  # of the onset: a peak there leaves no trace, and the table has no slope
 PEAKS = 16  # between the onset and the largest peak, that are compared with a contact's change
+RINGS = 8  # of a contact, over which a pressure that falls is averaged
 MAX_LIMITED = 4  # times that parameters are held at their limits, before what is left is taken
 
 
@@ -95,7 +95,7 @@ class _Begun:
     ) -> _Begun:
         each, own = with_kind(fit, field, account, k, kind)
         family = field.of(each, fits_peaks=frame.fits_peaks)
-        is_own = np.isin(np.arange(family.count), own)
+        is_own = _among(family.count, own)
         alone = replace(family, free=family.free & is_own[:, None])
         return cls(family, each, own, alone.draw(alone.join(each)))
 
@@ -105,7 +105,7 @@ def _of_kind(
 ) -> Prediction:
     family, each, own = begun.family, begun.each, begun.own
     old, light = account.family, account.is_hardly_pressed[k]
-    is_own = np.isin(np.arange(family.count), own)
+    is_own = _among(family.count, own)
     jacobian = np.empty((len(step.residual), len(family.join(each)) + 1))
     kept = np.delete(old.index, k, axis=0)
     jacobian[:, family.index[~is_own][family.free[~is_own]]] = account.jacobian[:, kept[kept >= 0]]
@@ -134,7 +134,7 @@ def at_end(
     """What a fit comes to where it goes on, and some of its contacts; all if None."""
     fitted = account.fitted
     own = np.arange(account.family.count) if own is None else own
-    is_below = np.isin(np.arange(account.family.count), own) & account.is_hardly_pressed
+    is_below = _among(account.family.count, own) & account.is_hardly_pressed
     at = _At(
         account.family,
         fitted.parameters,
@@ -144,6 +144,12 @@ def at_end(
         is_below,
     )
     return _end(fit, at, frame, own, account.unit)
+
+
+def _among(count: int, own: IntArray) -> BoolArray:
+    is_own = np.zeros(count, bool)
+    is_own[own] = True
+    return is_own
 
 
 def start_of(
@@ -160,19 +166,19 @@ def start_of(
     graded = next((r for r in fit.responses.values() if isinstance(r, GradedResponse)), None)
     if graded is None or not len(contacts):
         return contacts
-    before, after = (_drawn(field, some) for some in (contact[None], contacts))
-    asked = before.share @ graded.relative_change(before.pressure_kpa)[0]
-    most = float(contacts[:, PEAK].max())
     peaks = np.linspace(field.onset, field.peak_limits[1], PEAKS)
-    pressure = peaks[:, None] / most * after.pressure_kpa
-    changes = graded.relative_change(pressure)[0] @ after.share
-    contacts[:, PEAK] *= np.interp(abs(asked), np.abs(changes), peaks) / most
+    changes = _mean_changes(graded, contacts[0], field.unit_kpa * peaks)
+    asked = _mean_changes(graded, contact, field.unit_kpa * contact[PEAK, None])
+    contacts[:, PEAK] = np.interp(asked, changes, peaks)
     return contacts
 
 
-def _drawn(field: PressureField, contacts: FloatArray) -> Drawing:
-    family = field.of(contacts)
-    return family.draw(family.join(contacts))
+def _mean_changes(graded: GradedResponse, contact: FloatArray, peaks_kpa: FloatArray) -> FloatArray:
+    """|Relative change| of the graded sheet, mean over a contact (COLUMNS,) of each peak (n,)."""
+    q_squared = (np.arange(RINGS) + 0.5) / RINGS  # rings of equal area, see `pressure_field`
+    pressed = q_squared[q_squared > contact[HOLE] / 4]
+    pressure = peaks_kpa[:, None] * (1 - pressed) ** contact[EDGE]
+    return np.asarray(np.abs(graded.relative_change(pressure)[0]).sum(axis=1) / RINGS)
 
 
 @dataclass(frozen=True)
@@ -206,23 +212,25 @@ def _end(fit: FieldFit, at: _At, frame: Frame, own: IntArray, unit: float) -> Pr
 
 def _newton(fit: FieldFit, at: _At, normal: FloatArray, gradient: FloatArray) -> FloatArray:
     """The step (N + 1,) to the minimum, as far as the limits of parameters and log ratio let it."""
-    step, held = np.zeros(len(gradient)), np.zeros(len(gradient), bool)
-    for _ in range(MAX_LIMITED):
+    step = np.asarray(-np.linalg.solve(normal, gradient), np.float64)
+    held = np.zeros(len(gradient), bool)
+    for taken in range(1, MAX_LIMITED + 1):
+        limited = _limited(fit, at, step)
+        beyond = ~held & (np.abs(limited - step) > 1e-12)
+        step, held = limited, held | beyond
+        if not beyond.any() or held.all() or taken == MAX_LIMITED:
+            break
         free = ~held
         pull = gradient[free] + normal[np.ix_(free, held)] @ step[held]
         step[free] = -np.linalg.solve(normal[np.ix_(free, free)], pull)
-        limited = _limited(fit, at, step)
-        beyond = free & (np.abs(limited - step) > 1e-12)
-        step, held = limited, held | beyond
-        if not beyond.any() or held.all():
-            break
     return step
 
 
 def _limited(fit: FieldFit, at: _At, step: FloatArray) -> FloatArray:
     """A step (N + 1,), cut where a parameter or the log ratio has its limit."""
     family = at.family
-    each = family.split(family.bounded(at.parameters + step[:-1]))
+    parameters = family.bounded(at.parameters + step[:-1])
+    each = family.split(family.as_light(parameters, at.parameters))
     each[at.is_below, PEAK] = np.minimum(each[at.is_below, PEAK], BELOW * family.onset)
     ratio = fit.bounded_ratio(at.log_ratio + float(step[-1]))
     return np.append(family.join(each) - at.parameters, ratio - at.log_ratio)

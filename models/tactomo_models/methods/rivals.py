@@ -45,6 +45,7 @@ class Rival:
     frames: int = 0  # how many these are
     found: Prediction | None = None  # where it was asked last, all contacts moved with it
     is_far: bool = False  # whether that was too far a step to predict
+    asked_at: float = 0.0  # log evidence of the field when it was asked
 
     @property
     def is_one(self) -> bool:
@@ -55,6 +56,11 @@ class Rival:
     def is_unsure(self) -> bool:
         """Whether nothing but a prediction from afar is known of it."""
         return self.is_far and not self.is_solved
+
+    def may_matter(self, now: float) -> bool:
+        """Whether it may have become likely, the field having come to such a log evidence."""
+        least = min(OPEN, (self.asked_at - now) / 2)
+        return self.log_odds >= least or self.is_unsure
 
     @property
     def is_doubtful(self) -> bool:
@@ -137,6 +143,7 @@ def as_solved(
 def _rival_of(
     found: Prediction, log_odds: float, contact: FloatArray, before: Rival | None
 ) -> Rival:
+    asked_at = found.log_evidence - log_odds
     if before is not None:
         log_odds = before.mean(log_odds)
     is_one = len(found.contacts) == 1
@@ -147,6 +154,7 @@ def _rival_of(
         before=before.before if before else 0.0,
         frames=before.frames if before else 0,
         found=found,
+        asked_at=asked_at,
     )
 
 
@@ -158,6 +166,7 @@ def turned(
     sigmas: FloatArray,
     log_odds: float,
     is_solved: bool,
+    now: float,
 ) -> Rivals:
     """The rivals of a contact that has become one of them.
 
@@ -169,6 +178,7 @@ def turned(
         sigmas: (COLUMNS,) standard uncertainties as it was.
         log_odds: of what it is over what it was.
         is_solved: whether these are of solved fields.
+        now: log evidence of the field as it is.
     """
     moved = after - before
     others = {
@@ -183,12 +193,15 @@ def turned(
         for other, rival in rivals.items()
         if other is not kind
     }
-    back = Rival(-log_odds, -moved, sigmas, is_open=True, is_solved=is_solved)
+    back = Rival(-log_odds, -moved, sigmas, is_open=True, is_solved=is_solved, asked_at=now)
     return others | {kind_of(before): back}
 
 
-def in_another_frame(rivals: Rivals) -> Rivals:
-    """The same, without where they were found: in another frame that is elsewhere."""
+def in_another_frame(rivals: Rivals, now: float) -> Rivals:
+    """The same, without where they were found: in another frame that is elsewhere.
+
+    `now` is the log evidence of the field there.
+    """
     return {
         kind: replace(
             one,
@@ -197,21 +210,21 @@ def in_another_frame(rivals: Rivals) -> Rivals:
             before=one.log_odds,
             frames=one.frames + (one.is_solved or one.found is not None),
             found=None,
+            asked_at=now,
         )
         for kind, one in rivals.items()
     }
 
 
-def opened(rivals: Rivals, gain: float) -> Rivals:
-    """The same, to be asked again where a change of such a gain elsewhere may matter.
+def opened(rivals: Rivals, now: float) -> Rivals:
+    """The same, to be asked again where so much was gained since they were that it may matter.
 
-    Whether a contact is there at all costs little to ask.
+    `now` is the log evidence of the field. Whether a contact is there at all costs little to ask.
     """
-    least = min(OPEN, -gain / 2)
     return {
         kind: replace(
             one,
-            is_open=one.is_open or one.log_odds >= least or one.is_unsure or kind is Kind.NONE,
+            is_open=one.is_open or one.may_matter(now) or kind is Kind.NONE,
             is_solved=one.is_solved and one.predicted is not None,
             frames=0,
             found=None,

@@ -7,7 +7,7 @@ uncertainties know how far they are apart.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -160,28 +160,31 @@ class FieldAccountant:
         image[near] = values.sum(axis=1) / values.shape[1]
         return image.reshape(self._shape)
 
-    def _alone(self, family: PressureField, contact: FloatArray) -> _Alone:
-        """One contact (COLUMNS,) by itself: its images and numbers."""
-        reach = np.exp(contact[SIZE] + np.hypot(contact[E1], contact[E2])) * 1.3 + self._cell_m
-        dx, dy = self._x[:, 0] - UNIT_M * contact[X], self._y[:, 0] - UNIT_M * contact[Y]
-        near = np.flatnonzero((np.abs(dx) < reach) & (np.abs(dy) < reach))
+    def _alone(self, family: PressureField, kinds: FloatArray) -> _Alone:
+        """What one contact is by itself, of each kind (n, COLUMNS) that it may be."""
+        reach = np.exp(kinds[:, SIZE] + np.hypot(kinds[:, E1], kinds[:, E2])) * 1.3 + self._cell_m
+        of_kinds = (self._x[:, 0], X), (self._y[:, 0], Y)
+        is_near = [abs(at[:, None] - UNIT_M * kinds[:, axis]) < reach for at, axis in of_kinds]
+        near = np.flatnonzero((is_near[0] & is_near[1]).any(axis=1))
         x, y = self._x[near], self._y[near]
-        found = family.sampled(contact[None], x.ravel(), y.ravel(), self._step_m)
-        _, share, pressure = np.reshape(found, (3, *x.shape))
+        drawn = [family.sampled(one[None], x.ravel(), y.ravel(), self._step_m) for one in kinds]
+        _, share, pressure = np.reshape(drawn, (len(kinds), 3, *x.shape)).swapaxes(0, 1)
         magnitude, saturation = self._responses(pressure)
-        total = max(float(share.sum()), 1e-12)
-        values = (share * magnitude, share * saturation, share * pressure)
-        peak = np.array(family.unit_kpa * contact[PEAK])
-        size, slope = 0.0, 0.0
+        values = np.stack([share * magnitude, share * saturation, share * pressure])
+        total = np.maximum(share.sum(axis=(1, 2)), 1e-12)
+        by_magnitude, _, by_pressure = values.sum(axis=(2, 3))
+        peak = family.unit_kpa * kinds[:, PEAK]
+        size = slope = np.zeros(len(kinds))
         if isinstance(self._graded, GradedResponse):
-            size, slope = (abs(float(of)) for of in self._graded.relative_change(peak))
+            size, slope = np.abs(self._graded.relative_change(peak))
         return _Alone(
-            images=tuple(self._image(near, one) for one in values),
+            near,
+            images=values.mean(axis=3),
             area_m2=total * self._step_m**2,
-            magnitude=float(values[0].sum()) / total,
-            mean_kpa=float(values[2].sum()) / total,
-            force_n=1e3 * float(values[2].sum()) * self._step_m**2,
-            peak_kpa=float(peak),
+            magnitude=by_magnitude / total,
+            mean_kpa=by_pressure / total,
+            force_n=1e3 * by_pressure * self._step_m**2,
+            peak_kpa=peak,
             peak_magnitude=size,
             slope=slope,
         )
@@ -197,88 +200,74 @@ class FieldAccountant:
         """The mean over what a contact may be; uncertainties know how far that is apart."""
         odds = np.array([1.0, *(one.odds for one in likely)])
         share = odds / odds.sum()
-        kinds = [contact, *(each.contact for each in likely)]
-        alone = [self._alone(family, one) for one in kinds]
+        kinds = np.stack([contact, *(each.contact for each in likely)])
+        alone = self._alone(family, kinds)
 
-        def mean(of: Callable[[_Alone], Any], share: FloatArray = share) -> Any:
-            return sum(w * (of(one) - of(alone[0])) for w, one in zip(share, alone, strict=True))
+        def mean(of: FloatArray, share: FloatArray = share) -> Any:
+            return share @ (of - of[0])
 
-        def spread(of: Callable[[_Alone], float]) -> float:
-            values = np.array([of(one) for one in alone])
-            return float(np.sqrt(share @ (values - share @ values) ** 2))
+        def spread(of: FloatArray) -> float:
+            return float(np.sqrt(share @ (of - share @ of) ** 2))
 
         # The mean of a disc and a ring is a dent, which neither of them has.
-        is_alike = [(one[HOLE] > 0) == (contact[HOLE] > 0) for one in kinds]
+        is_alike = (kinds[:, HOLE] > 0) == (contact[HOLE] > 0)
         alike = odds * is_alike / (odds @ is_alike)
-        images = [
-            image + mean(partial(_Alone.image, at=at), shares)
-            for at, (image, shares) in enumerate(
-                ((shown.map, share), (shown.structure, share), (shown.pressure_kpa, alike))
-            )
-        ]
+        images = [shown.map.copy(), shown.structure.copy(), shown.pressure_kpa.copy()]
+        for image, of, shares in zip(images, alone.images, (share, share, alike), strict=True):
+            image.flat[alone.near] += mean(of, shares)
         shown = replace(shown, map=images[0], structure=images[1], pressure_kpa=images[2])
         if len(own) != 1:
             return shown
         at = own[0]
 
-        def moved(values: FloatArray, of: Callable[[_Alone], float]) -> FloatArray:
+        def moved(values: FloatArray, of: FloatArray) -> FloatArray:
             changed = np.array(values, float)
             changed[at] = max(changed[at] + mean(of), 0.0)
             return changed
 
-        def wider(
-            sigmas: FloatArray, of: Callable[[_Alone], float], more: float = 0.0
-        ) -> FloatArray:
+        def wider(sigmas: FloatArray, of: FloatArray, more: float = 0.0) -> FloatArray:
             changed = np.array(sigmas, float)
             changed[at] = np.sqrt(changed[at] ** 2 + spread(of) ** 2 + more)
             return changed
 
         areas = shown.areas
         sigmas = areas.sigmas.copy()
-        sigmas[:, 2] = wider(sigmas[:, 2], lambda one: one.area_m2)
-        areas = replace(
-            areas, areas_m2=moved(areas.areas_m2, lambda one: one.area_m2), sigmas=sigmas
-        )
+        sigmas[:, 2] = wider(sigmas[:, 2], alone.area_m2)
+        areas = replace(areas, areas_m2=moved(areas.areas_m2, alone.area_m2), sigmas=sigmas)
         contacts = shown.contacts
         if contacts is not None:
             of_peaks = family.unit_kpa * np.array([0.0, *(one.sigmas[PEAK] for one in likely)])
-            slopes = np.array([one.slope for one in alone])
             # Whatever else it may be has a peak of its own uncertainty.
-            by_peak = slopes * of_peaks
+            by_peak = alone.slope * of_peaks
             more = float(share @ by_peak**2)
             own_sigmas = np.hypot(contacts.peak_magnitude_sigma[at], by_peak)
-            peaks = np.array([one.peak_magnitude for one in alone])
             sides = contacts.peak_magnitude_sides.copy()
-            sides[:, at] = _sides(share, peaks, own_sigmas)
-            evenest = min(
-                zip((contact, *(one.contact for one in likely)), alone, strict=True),
-                key=lambda one: one[0][EDGE],
-            )[1]
+            sides[:, at] = _sides(share, alone.peak_magnitude, own_sigmas)
             felt = np.array(contacts.felt, float)
-            felt[at] = evenest.peak_magnitude
+            felt[at] = alone.peak_magnitude[kinds[:, EDGE].argmin()]
             contacts = replace(
                 contacts,
-                peak_magnitude=moved(contacts.peak_magnitude, lambda one: one.peak_magnitude),
+                peak_magnitude=moved(contacts.peak_magnitude, alone.peak_magnitude),
                 peak_magnitude_sigma=wider(
-                    contacts.peak_magnitude_sigma, lambda one: one.peak_magnitude, more
+                    contacts.peak_magnitude_sigma, alone.peak_magnitude, more
                 ),
                 peak_magnitude_sides=sides,
                 felt=felt,
-                peak_kpa=moved(contacts.peak_kpa, lambda one: one.peak_kpa),
-                mean_kpa=moved(contacts.mean_kpa, lambda one: one.mean_kpa),
-                mean_sigma_kpa=wider(contacts.mean_sigma_kpa, lambda one: one.mean_kpa),
-                force_n=moved(contacts.force_n, lambda one: one.force_n),
-                force_sigma_n=wider(contacts.force_sigma_n, lambda one: one.force_n),
-                total_force_n=contacts.total_force_n + mean(lambda one: one.force_n),
+                peak_kpa=moved(contacts.peak_kpa, alone.peak_kpa),
+                mean_kpa=moved(contacts.mean_kpa, alone.mean_kpa),
+                mean_sigma_kpa=wider(contacts.mean_sigma_kpa, alone.mean_kpa),
+                force_n=moved(contacts.force_n, alone.force_n),
+                force_sigma_n=wider(contacts.force_sigma_n, alone.force_n),
+                total_force_n=contacts.total_force_n + mean(alone.force_n),
                 total_force_sigma_n=float(
-                    np.hypot(contacts.total_force_sigma_n, spread(lambda one: one.force_n))
+                    np.hypot(contacts.total_force_sigma_n, spread(alone.force_n))
                 ),
             )
         return replace(
             shown,
             areas=areas,
-            magnitudes=moved(shown.magnitudes, lambda one: one.magnitude),
-            magnitude_sigmas=wider(shown.magnitude_sigmas, lambda one: one.magnitude),
+            magnitudes=moved(shown.magnitudes, alone.magnitude),
+            magnitude_sigmas=wider(shown.magnitude_sigmas, alone.magnitude),
             contacts=contacts,
         )
 
@@ -491,17 +480,14 @@ def _sides(share: FloatArray, means: FloatArray, sigmas: FloatArray) -> FloatArr
 
 @dataclass(frozen=True)
 class _Alone:
-    """One contact by itself."""
+    """One contact by itself, of each kind that it may be."""
 
-    images: tuple[FloatArray, ...]  # of the map, the structure and the pressure in kPa
-    area_m2: float
-    magnitude: float  # |relative conductivity change|, mean over the area
-    mean_kpa: float
-    force_n: float
-    peak_kpa: float
-    peak_magnitude: float  # |relative conductivity change| under the peak
-    slope: float  # of that by the pressure
-
-    def image(self, at: int) -> FloatArray:
-        """One of its images."""
-        return self.images[at]
+    near: IntArray  # (c,) map cells that it may touch
+    images: FloatArray  # (3, n, c) of the map, the structure and the pressure in kPa
+    area_m2: FloatArray  # (n,), as all below
+    magnitude: FloatArray  # |relative conductivity change|, mean over the area
+    mean_kpa: FloatArray
+    force_n: FloatArray
+    peak_kpa: FloatArray
+    peak_magnitude: FloatArray  # |relative conductivity change| under the peak
+    slope: FloatArray  # of that by the pressure

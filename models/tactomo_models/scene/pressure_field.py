@@ -54,6 +54,8 @@ from tactomo_models.scene.parameters import (
 )
 from tactomo_models.scene.sheet_response import GradedResponse
 
+BELOW = 1 - 1e-9  # of the onset: a peak there leaves no trace, and the table has no slope
+
 
 class _Field(Structure):
     """What C knows of a field: see `inner_loop.c`."""
@@ -223,10 +225,22 @@ class PressureField:
         each[falls, EDGE] = np.clip(each[falls, EDGE], *EDGE_LIMITS)
         return self.join(each)
 
+    def as_light(self, parameters: FloatArray, before: FloatArray) -> FloatArray:
+        """Parameters (N,) of which peaks too light for the graded sheet before still are.
+
+        Down there no slope tells how far to go.
+        """
+        light = self.light(before)
+        if not light.any():
+            return parameters
+        kept, peaks = parameters.copy(), self.index[light, PEAK]
+        kept[peaks] = np.minimum(kept[peaks], BELOW * self.onset)
+        return kept
+
     def draw(self, parameters: FloatArray) -> Drawing:
         """Draw the field on the nodes."""
         each = self.split(parameters)
-        of = byref(self._for_c(False))
+        of = byref(self._for_c())
         points = len(self.x_m)
         nodes, found = np.empty(points, np.intp), np.empty((4, points))
         places = at(self.x_m), at(self.y_m)
@@ -246,9 +260,10 @@ class PressureField:
         enclosed, enclosed_kpa, share, pressure = found[:, :count].copy()
         return Drawing(nodes, enclosed, enclosed_kpa, share, pressure, slopes)
 
-    def _for_c(self, is_sharp: bool) -> _Field:
-        of = self.half_width_m, self.offset_m, self.unit_kpa, self.blur_m2
-        return _Field(*of, self.forms, is_sharp)
+    def _for_c(self, step_m: float | None = None) -> _Field:
+        """For C; as sharp as points a step apart can show it, where there is one."""
+        width, blur = (self.half_width_m, self.blur_m2) if step_m is None else (step_m, 0.0)
+        return _Field(width, self.offset_m, self.unit_kpa, blur, self.forms, step_m is not None)
 
     def sampled(
         self, each: FloatArray, x_m: FloatArray, y_m: FloatArray, step_m: float
@@ -257,10 +272,9 @@ class PressureField:
 
         Outlines are as sharp as the points can show them.
         """
-        sharp = replace(self, half_width_m=step_m, blur_m2=0.0)
         found = np.empty((4, len(x_m)))
         places = len(x_m), at(x_m), at(y_m)
-        of = byref(sharp._for_c(True))
+        of = byref(self._for_c(step_m))
         LIBRARY.draw(of, len(each), at(each), *places, None, *_rows(found))
         return found[0], found[2], found[3]
 
