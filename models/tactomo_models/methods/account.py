@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from tactomo_protocol import Channel
@@ -213,14 +213,8 @@ def _stepped(
     """The field after a step downhill; None where none is worth a solve."""
     fitted = account.fitted
     family, scale = account.family, account.prior[0]
-
-    def limited(step: FloatArray) -> FloatArray:
-        parameters = family.bounded(fitted.parameters + step[:-1])
-        if stays_light:
-            parameters = family.as_light(parameters, fitted.parameters)
-        ratio = fit.bounded_ratio(fitted.log_ratio + float(step[-1]))
-        return np.append(parameters - fitted.parameters, ratio - fitted.log_ratio)
-
+    light = family.light(fitted.parameters) & stays_light
+    limited = partial(limited_step, fit, family, fitted.parameters, fitted.log_ratio, light)
     steps = damped_steps(normal, gradient, scale, fitted.damping, limited, account.unit)
     for step, damping in steps:
         parameters, ratio = fitted.parameters + step[:-1], fitted.log_ratio + float(step[-1])
@@ -229,6 +223,29 @@ def _stepped(
         if trial.cost < fitted.cost:
             return replace(trial, damping=max(damping / 5, 1e-3))
     return None
+
+
+def limited_step(
+    fit: FieldFit,
+    family: PressureField,
+    parameters: FloatArray,
+    log_ratio: float,
+    light: BoolArray,
+    step: FloatArray,
+) -> FloatArray:
+    """A step (N + 1,), cut where a parameter or the log ratio has its limit.
+
+    Args:
+        fit: what knows the limits of the log ratio.
+        family: the contacts.
+        parameters: (N,) where the step begins.
+        log_ratio: likewise.
+        light: (K,) contacts whose peaks stay below the graded sheet's onset.
+        step: the step.
+    """
+    after = family.as_light(family.bounded(parameters + step[:-1]), light)
+    ratio = fit.bounded_ratio(log_ratio + float(step[-1]))
+    return np.append(after - parameters, ratio - log_ratio)
 
 
 def damped_steps(

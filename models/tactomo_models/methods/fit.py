@@ -183,6 +183,8 @@ class Fit:
         self, belief: Belief, companions: Mapping[str, CompanionForce]
     ) -> dict[str, tuple[float, float]]:
         """The force that each companion should feel of a belief, and its standard uncertainty."""
+        if not companions:  # in every frame of most sensors
+            return {}
         drawing = belief.account.fitted.drawing
         by_share, by_pressure = drawing.slopes()[2:]
         share, pressure = drawing.share, drawing.pressure_kpa

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
-from tactomo_models.methods.account import Account, Frame, laplace
+from tactomo_models.methods.account import Account, Frame, laplace, limited_step
 from tactomo_models.methods.kinds import Kind, as_kind
 from tactomo_models.scene.drawing import Drawing
 from tactomo_models.scene.field_fit import FieldFit, Step
@@ -214,8 +214,9 @@ def _newton(fit: FieldFit, at: _At, normal: FloatArray, gradient: FloatArray) ->
     """The step (N + 1,) to the minimum, as far as the limits of parameters and log ratio let it."""
     step = np.asarray(-np.linalg.solve(normal, gradient), np.float64)
     held = np.zeros(len(gradient), bool)
+    light = at.is_below | at.family.light(at.parameters)
     for taken in range(1, MAX_LIMITED + 1):
-        limited = _limited(fit, at, step)
+        limited = limited_step(fit, at.family, at.parameters, at.log_ratio, light, step)
         beyond = ~held & (np.abs(limited - step) > 1e-12)
         step, held = limited, held | beyond
         if not beyond.any() or held.all() or taken == MAX_LIMITED:
@@ -224,13 +225,3 @@ def _newton(fit: FieldFit, at: _At, normal: FloatArray, gradient: FloatArray) ->
         pull = gradient[free] + normal[np.ix_(free, held)] @ step[held]
         step[free] = -np.linalg.solve(normal[np.ix_(free, free)], pull)
     return step
-
-
-def _limited(fit: FieldFit, at: _At, step: FloatArray) -> FloatArray:
-    """A step (N + 1,), cut where a parameter or the log ratio has its limit."""
-    family = at.family
-    parameters = family.bounded(at.parameters + step[:-1])
-    each = family.split(family.as_light(parameters, at.parameters))
-    each[at.is_below, PEAK] = np.minimum(each[at.is_below, PEAK], BELOW * family.onset)
-    ratio = fit.bounded_ratio(at.log_ratio + float(step[-1]))
-    return np.append(family.join(each) - at.parameters, ratio - at.log_ratio)

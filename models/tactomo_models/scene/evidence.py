@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.special import chdtri, gammaln
@@ -57,9 +58,12 @@ class Likelihood:
 
     def log(self, chi_squared: float) -> float:
         """Logarithm of the likelihood, of whitened data: comparable with that of more of them."""
+        return float(self._log_scale - self.count * np.log(self.count + chi_squared))
+
+    @cached_property
+    def _log_scale(self) -> float:
         n = self.count
-        scale = gammaln(n) - gammaln(n / 2) + n / 2 * np.log(n / np.pi)
-        return float(scale - n * np.log(n + chi_squared))
+        return float(gammaln(n) - gammaln(n / 2) + n / 2 * np.log(n / np.pi))
 
     def precision(self, chi_squared: float) -> float:
         """Factor on the errors' inverse variance that is likely where this much is left."""

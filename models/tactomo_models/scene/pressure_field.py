@@ -225,12 +225,11 @@ class PressureField:
         each[falls, EDGE] = np.clip(each[falls, EDGE], *EDGE_LIMITS)
         return self.join(each)
 
-    def as_light(self, parameters: FloatArray, before: FloatArray) -> FloatArray:
-        """Parameters (N,) of which peaks too light for the graded sheet before still are.
+    def as_light(self, parameters: FloatArray, light: BoolArray) -> FloatArray:
+        """Parameters (N,) with the peaks of some contacts (K,) below the graded sheet's onset.
 
         Down there no slope tells how far to go.
         """
-        light = self.light(before)
         if not light.any():
             return parameters
         kept, peaks = parameters.copy(), self.index[light, PEAK]
