@@ -333,31 +333,6 @@ def test_the_device_restarts(
     assert len(daemon.told("tared")) == 1
 
 
-@pytest.mark.slow
-@pytest.mark.fault(
-    "The two boards plugged into each other's place",
-    "each board names its own channel: frames continue without a flag",
-    "both cables exchanged at 20 dual scans/s",
-)
-def test_the_boards_are_exchanged(
-    tared: Start, skin: PtySkin, scenes: Scenes, listen: Listen, play: Play, figure: Figure
-) -> None:
-    daemon = tared()
-    ears = listen(daemon)
-    skin.unplug()
-    wait_until_lost(daemon)
-    first, second = Channel
-    skin.lines[first], skin.lines[second] = skin.lines[second], skin.lines[first]
-    skin.plug()
-    begin_s, last = time.monotonic(), skin.counter - 1
-    play(still(scenes.rest))
-    frame = ears.wait(lambda h: h.fields["scan_counter"] > last and not h.fields["flags"], "frames")
-    figure(f"frames without a flag after {frame.arrived_ns * 1e-9 - begin_s:.2f} s")
-    time.sleep(1.0)
-    late = [h for h in ears.heard if h.arrived_ns > frame.arrived_ns]
-    assert not any(heard.fields["flags"] for heard in late)
-
-
 @pytest.mark.faults
 @pytest.mark.parametrize(
     ("what", "event"), [("nothing", "device_silent"), ("noise at 2 kB/s", "device_garbled")]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import socket as posix
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -28,33 +27,6 @@ Figure = Callable[[str], None]
 KILLS = 10
 DAY_S = 86_400
 FAKETIME = "/usr/lib/{}-linux-gnu/faketime/libfaketimeMT.so.1"
-
-# A daemon whose reconstruction raises where a file says so, once for a file, always for a folder;
-# and hangs for as long as there is a file of another name.
-INJECTED = """
-import sys, time
-from pathlib import Path
-from tactomo.config import load_config
-from tactomo.service.daemon import Daemon
-from tactomo.log import configure_logging
-from tactomo_models import Reconstructor, load_description, load_or_build_artifact
-
-class Injected(Reconstructor):
-    def compare(self, *arguments, **options):
-        trigger = Path(sys.argv[1]).with_name("raise")
-        if trigger.exists():
-            if trigger.is_file():
-                trigger.unlink()
-            raise ZeroDivisionError("made to fail")
-        while Path(sys.argv[1]).with_name("hang").exists():
-            time.sleep(0.01)
-        return super().compare(*arguments, **options)
-
-configure_logging("info", "json")
-description = load_description("paper_square")
-reconstructor = Injected(description, load_or_build_artifact(description))
-sys.exit(Daemon(load_config(sys.argv[1]), reconstructor=reconstructor).run())
-"""
 
 
 def counters(path: Path) -> set[int]:
@@ -215,51 +187,6 @@ def test_the_wall_clock_is_set(
     assert duration_s < 60
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("when", ["once", pytest.param("always for 3 s", marks=pytest.mark.faults)])
-@pytest.mark.fault(
-    "A reconstruction that raises, {when}",
-    "an event (at most one a second); the next dual scan that can be reconstructed is "
-    "published; nothing else stops",
-    "a reconstructor that raises while a file exists, in an otherwise usual daemon",
-)
-def test_a_reconstruction_that_raises(
-    tared: Start,
-    scenes: Scenes,
-    play: Play,
-    listen: Listen,
-    figure: Figure,
-    tmp_path: Path,
-    when: str,
-) -> None:
-    daemon = tared(program=INJECTED)
-    ears = listen(daemon, "contacts", "status")
-    playing = play(still(scenes.rest), 50.0)
-    ears.wait(lambda h: h.kind == "contacts", "a frame")
-    trigger = tmp_path / "raise"
-    if when == "once":
-        trigger.write_text("")
-        wait_until(lambda: not trigger.exists(), "the failure")
-    else:
-        trigger.mkdir()
-        time.sleep(3.0)
-        assert daemon.answers()
-        trigger.rmdir()
-    ended_s = time.monotonic()
-    frame = ears.wait(lambda h: h.arrived_ns * 1e-9 > ended_s and h.kind == "contacts", "a frame")
-    time.sleep(0.2)
-    playing.stop()
-    told = [e for e in daemon.told("reconstruction_failed") if "next_step" in e]
-    missing = len(playing.sent) - len(ears.of("contacts"))
-    figure(
-        f"{len(told)} events; {missing} of {len(playing.sent)} frames missing, the next one after "
-        f"{frame.arrived_ns * 1e-9 - ended_s:.2f} s"
-    )
-    assert 1 <= len(told) <= (1 if when == "once" else 4)
-    if when == "once":
-        assert missing <= 3
-
-
 @pytest.mark.faults
 @pytest.mark.fault(
     "The network files vanish",
@@ -292,48 +219,3 @@ def test_the_networks_vanish(
         assert daemon.stop() < 2.0
     figure(f"first frame with a contact: {said[0]} while it runs, {said[1]} after the restart")
     assert said == ["proposed", "cold start"]
-
-
-@pytest.mark.faults
-@pytest.mark.fault(
-    "A reconstruction that hangs for 8 s",
-    "the watchdog is not fed although every other thread runs, and is fed again afterwards",
-    "a reconstructor that hangs while a file exists, in an otherwise usual daemon; a watchdog of "
-    "2 s on a socket as systemd's",
-)
-def test_a_reconstruction_that_hangs(
-    tared: Start, scenes: Scenes, play: Play, figure: Figure, tmp_path: Path
-) -> None:
-    address = tmp_path / "notify"
-    with posix.socket(posix.AF_UNIX, posix.SOCK_DGRAM) as manager:
-        manager.bind(str(address))
-        manager.setblocking(False)
-        environment = {"NOTIFY_SOCKET": str(address), "WATCHDOG_USEC": "2000000"}
-        daemon = tared(program=INJECTED, environment=environment)
-        play(still(scenes.rest))
-        healthy = fed(manager, 5.0)
-        (tmp_path / "hang").write_text("")
-        fed(manager, 2.0)
-        hanging = fed(manager, 6.0)
-        answered = daemon.answers()
-        (tmp_path / "hang").unlink()
-        again = fed(manager, 5.0)
-    figure(
-        f"fed {healthy} times in 5 s before, {hanging} times from 2 to 8 s of hanging, {again} "
-        f"times in the 5 s after it; the control socket answered meanwhile"
-    )
-    assert healthy >= 3
-    assert hanging == 0
-    assert again >= 2
-    assert answered
-
-
-def fed(manager: posix.socket, seconds: float) -> int:
-    """Return how often the watchdog is fed in so many seconds."""
-    end_s, times = time.monotonic() + seconds, 0
-    while time.monotonic() < end_s:
-        try:
-            times += manager.recv(4096).count(b"WATCHDOG=1")
-        except BlockingIOError:
-            time.sleep(0.02)
-    return times
