@@ -208,20 +208,3 @@ def test_every_key_of_the_configuration_can_be_set(tactomo: Run) -> None:
         assert result.returncode == 1
         assert f"command line: {key}" in result.stderr
         assert "unknown" not in result.stderr, key
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("arguments", "status", "says"),
-    [
-        (["--version"], 0, ""),
-        (["info", "nosuchsensor"], 1, "tactomo: cannot read the sensor description nosuchsensor"),
-        (["info"], 2, "Missing argument"),
-    ],
-)
-def test_the_exit_status_of_a_process(arguments: list[str], status: int, says: str) -> None:
-    command = [sys.executable, "-m", "tactomo.cli", *arguments]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.returncode == status
-    assert says in result.stderr
-    assert "Traceback" not in result.stderr

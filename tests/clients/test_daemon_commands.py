@@ -96,13 +96,6 @@ def test_a_recording_ends_with_its_block_whatever_happens_in_it(tmp_path: Path) 
     assert [name for name, _ in control.requests] == ["record_start", "record_stop"] * 3
 
 
-def test_a_path_here_is_made_absolute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    with FakeControl({"record_start": {"path": "x"}}) as control, Daemon(control.address) as daemon:
-        daemon.record_start("grasp.mcap")
-    assert control.requests == [("record_start", {"path": "grasp.mcap"})]
-
-
 def test_a_daemon_that_was_away_answers_again() -> None:
     with FakeControl({"tare": {"scans": 1}}) as control:
         daemon = Daemon(control.address, timeout_s=PATIENCE_S)

@@ -81,10 +81,7 @@ class Bench:
 
 
 @pytest.fixture
-def bench(
-    twin: dict[str, list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Bench]:
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+def bench(twin: dict[str, list[str]], tmp_path: Path) -> Iterator[Bench]:
     bench = Bench(twin, tmp_path)
     yield bench
     bench.close()

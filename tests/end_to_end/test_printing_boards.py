@@ -63,19 +63,6 @@ def test_a_press_on_an_emulated_board_is_where_it_is(
     assert port["corrupt"] == 0
 
 
-@pytest.mark.long
-def test_a_board_of_another_kind_is_refused_by_name(start: Start, tmp_path: Path) -> None:
-    board, sensor = changed(tmp_path, "matrix_square"), changed(tmp_path, "matrix_disc")
-    _, daemon = start("matrix", board, description=sensor, protocol="matrix")
-    [refusal] = wait_until(lambda: daemon.told("device_refused"), "a refusal")
-    said = "1024 numbers a line, as of 32 electrodes"
-    assert said in refusal["detail"]
-    assert "description" in refusal["next_step"]
-    [port] = daemon.status()["ports"]
-    assert port["state"] == "refused"
-    assert said in port["problem"]
-
-
 @pytest.mark.slow
 def test_it_stands_what_happens_to_a_cable(start: Start, tmp_path: Path) -> None:
     board = changed(tmp_path, "matrix_disc")

@@ -19,7 +19,7 @@ from emulated_board import MeasuredSkin, changed, emulated, frame_where
 from shared_data import measured
 from tactomo.recordings.imported_scans import read_scans
 from tactomo.recordings.recording import open_recording
-from tactomo.twin import Twin, TwinConfig
+from tactomo.twin import Twin
 from tactomo_client import request
 from tactomo_client.recording import open_recording as open_frames
 from tactomo_models import load_description
@@ -113,21 +113,6 @@ def test_what_the_instrument_refuses_is_named(start: Start, tmp_path: Path) -> N
     assert "will not measure 500 frames a second (NACK 81)" in told["detail"]
     assert "[instrument]" in told["next_step"]
     assert daemon.status()["ports"][0]["state"] == "refused"
-
-
-@pytest.mark.long
-def test_ports_tells_what_speaks_sciospec(tmp_path: Path) -> None:
-    config = TwinConfig(
-        load_description(changed(tmp_path, TANK)),
-        protocol="sciospec",
-        control="tcp://127.0.0.1:0",
-    )
-    twin = Twin(config)
-    twin.start()
-    try:
-        assert "looks like --protocol sciospec" in tactomo("ports", *twin.ports, "--ask")
-    finally:
-        twin.stop()
 
 
 @pytest.mark.long

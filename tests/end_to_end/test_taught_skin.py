@@ -86,9 +86,8 @@ class Bench:
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_a_guided_session_makes_places_right(
-    twin: dict[str, list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: Any
+    twin: dict[str, list[str]], tmp_path: Path, request: Any
 ) -> None:
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     bench = Bench(twin, tmp_path)
     request.addfinalizer(bench.close)
     untaught, is_taught = bench.errors_mm()

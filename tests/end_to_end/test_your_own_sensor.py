@@ -37,8 +37,7 @@ SHORTER = {"--seconds 5": "--seconds 1", "doctor ": "doctor --seconds 2 "}
 
 
 @pytest.fixture
-def newcomer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Newcomer:
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+def newcomer(tmp_path: Path) -> Newcomer:
     for name in (FILE, "readings.csv"):
         (tmp_path / name).write_text(PAGE.file(name))
     return Newcomer(tmp_path, SMALLER | SHORTER)

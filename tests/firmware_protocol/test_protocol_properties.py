@@ -47,12 +47,6 @@ def test_any_packets_round_trip_in_any_chunks(data: st.DataObject, packets: list
     assert decoder.counts.unknown_type == sum(isinstance(p, UnknownPacket) for p in packets)
 
 
-@given(st.lists(SMALL_PACKETS, min_size=1, max_size=4))
-def test_byte_by_byte_is_the_same(packets: list[Packet]) -> None:
-    stream = b"".join(map(encode, packets))
-    assert feed_all(Decoder(), (stream[i : i + 1] for i in range(len(stream)))) == packets
-
-
 def runs() -> st.SearchStrategy[bytes]:
     """Bytes with runs without a zero about as long as a block holds."""
     run = st.sampled_from([0, 1, 253, 254, 255, 508, 509]).map(lambda size: b"\x07" * size)

@@ -39,12 +39,6 @@ ROWS = [(kpa, max(0.0, (kpa - 120) * 2e-3)) for kpa in (90, 130, 160, 190, 220, 
 CSV = "pressure_kpa,magnitude\n" + "".join(f"{kpa},{m:.4f}\n" for kpa, m in ROWS)
 
 
-@pytest.fixture(autouse=True)
-def _own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
-
-
 @pytest.mark.slow
 def test_a_table_of_magnitudes_is_fitted_kept_and_shown(tactomo: Run, tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text(CSV)

@@ -17,12 +17,6 @@ Run = Callable[..., Any]
 Arrays = dict[str, Any]
 
 
-@pytest.fixture(autouse=True)
-def _own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
-
-
 @pytest.fixture(scope="module")
 def good() -> Arrays:
     return presses(60, seed=1)
@@ -145,11 +139,6 @@ def unpressed(arrays: Arrays) -> Arrays:
     rest = {name: arrays[f"{name}_reference"] for name in ("magnitude", "structure")}
     noise = 1 + 1e-6 * np.random.default_rng(0).standard_normal((60, 208))
     return changed(arrays, **{name: noise * volts for name, volts in rest.items()})
-
-
-def turned(xy_mm: Any, degrees: float) -> Any:
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    return xy_mm @ np.array([[c, s], [-s, c]])
 
 
 def first(arrays: Arrays, count: int) -> Arrays:

@@ -257,13 +257,6 @@ def test_one_lost_scan_is_no_rate_of_loss(
     assert found["verdict"] == verdict
 
 
-@pytest.mark.slow
-def test_nobody_there(tactomo: Run) -> None:
-    outcome = tactomo("doctor", "--address", "ipc:///nowhere/at/all", "--seconds", "1")
-    assert outcome.returncode == 1
-    assert "no daemon answers at ipc:///nowhere/at/all" in outcome.stderr
-
-
 def test_the_broken_device_is_called_broken(tactomo: Run) -> None:
     outcome = tactomo("doctor", measured("skin_bad_device_32el.npz"))
     assert outcome.returncode == 1

@@ -17,6 +17,7 @@ import pytest
 from fake_control import FakeControl
 from tactomo.running import Running, announced
 from tactomo.service.health_issues import FLAG_ADVICE, health_issues
+from tactomo_client import ControlError
 from tactomo_client.fake import FakeSensor
 from tactomo_models import Flag
 from waiting import PATIENCE_S, repeated, wait_until
@@ -257,7 +258,9 @@ def test_tare_says_what_the_reference_is_made_of(
 
 
 def test_a_refusal_is_one_line_with_cause_and_next_step(tactomo: Run, control: Any) -> None:
-    control.answers["tare"] = ("tare_refused", "somebody presses", "let go and tare again")
+    control.answers["tare"] = ControlError(
+        "somebody presses", "let go and tare again", "tare_refused"
+    )
     result = tactomo("tare")
     assert result.returncode == 1
     assert result.stderr == "tactomo: somebody presses; let go and tare again\n"

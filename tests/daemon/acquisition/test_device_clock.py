@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import random
 from collections.abc import Callable
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tactomo.acquisition.device_clock import ClockState, DeviceClock, Point, lower_hull, slope_below
+from tactomo.acquisition.device_clock import ClockState, DeviceClock
 from tactomo_protocol import Channel
 
 BOOT_NS = 10**15
@@ -241,34 +240,6 @@ def test_whatever_a_device_says_nothing_is_acquired_after_it_came(
         now_ns += after_ns
         late_ns = clock.date(MAGNITUDE, device_us, now_ns)
         assert late_ns is None or late_ns >= 0
-
-
-@given(
-    st.dictionaries(st.integers(0, 10**12), st.integers(0, 10**12), min_size=2, max_size=40).map(
-        lambda points: [Point(at, lag) for at, lag in sorted(points.items())]
-    )
-)
-def test_no_point_lies_below_the_hull_and_its_edge_is_the_least_of_lines(
-    points: list[Point],
-) -> None:
-    hull = lower_hull(points)
-    assert hull[0] == points[0]
-    assert hull[-1] == points[-1]
-    for a, b in itertools.pairwise(hull):
-        for p in points:
-            cross = (b.arrived_ns - a.arrived_ns) * (p.lag_ns - a.lag_ns)
-            assert cross >= (b.lag_ns - a.lag_ns) * (p.arrived_ns - a.arrived_ns) or not (
-                a.arrived_ns <= p.arrived_ns <= b.arrived_ns
-            )
-
-    def distance(rate: float) -> float:
-        offset = min(p.lag_ns - rate * p.arrived_ns for p in points)
-        return sum(p.lag_ns - rate * p.arrived_ns - offset for p in points)
-
-    best = slope_below(points)
-    scale = sum(p.lag_ns for p in points) + abs(best) * sum(p.arrived_ns for p in points)
-    for change in (-0.1, -1e-3, 1e-3, 0.1):
-        assert distance(best) <= distance(best + change * (abs(best) + 1e-3)) + 1e-9 * scale
 
 
 @pytest.mark.parametrize("apart_us", [20_000_000, 3_600_000_000, 2**52])

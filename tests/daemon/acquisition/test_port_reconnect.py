@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import re
 import signal
 import subprocess
@@ -22,7 +21,7 @@ from tactomo.acquisition.adapters import holders
 from tactomo.acquisition.connection import Connection
 from tactomo.acquisition.liveness import PATIENCE_S
 from tactomo.acquisition.open_serial import DEVICE_GONE, open_serial
-from tactomo.errors import PortAbsentError, PortBusyError
+from tactomo.errors import PortBusyError
 from tactomo.events import EventBook
 from tactomo.timing import FEW
 from tactomo_models import load_description
@@ -137,32 +136,6 @@ def test_a_device_may_go_in_the_middle_of_a_call(
     assert [name for name, _ in told] == ["port_lost"]
 
 
-def test_a_pty_of_socat_that_is_killed_is_lost_and_found_again(
-    tmp_path: Path, connect: Connect, until: Until
-) -> None:
-    path = tmp_path / "socat"
-
-    def socat() -> subprocess.Popen[bytes]:
-        path.unlink(missing_ok=True)
-        made = subprocess.Popen(["socat", f"pty,raw,echo=0,link={path}", "pipe"])
-        until(path.exists)
-        return made
-
-    try:
-        process = socat()
-    except FileNotFoundError:
-        pytest.skip("needs socat")
-    connection = connect(path)
-    for _ in range(2):
-        until(connection.try_open)
-        assert connection.write(b"echo")
-        until(lambda: connection.read() != b"")
-        stop(process)
-        until(lambda: connection.read() == b"" and not connection.is_open)
-        process = socat()
-    stop(process)
-
-
 # Coming back
 
 
@@ -236,11 +209,6 @@ def test_a_daemon_may_wait_for_a_port_that_is_not_there_yet(bench: Start) -> Non
     b.listener.event("port_back")
     b.tare()
     b.until(lambda: b.step() and b.ask("status")["state"] == "running")
-
-
-def test_a_port_that_is_absent_is_told_apart(tmp_path: Path) -> None:
-    with pytest.raises(PortAbsentError, match="tactomo ports"):
-        open_serial(str(tmp_path / "nowhere"), 921_600)
 
 
 # Others who hold it
@@ -414,16 +382,6 @@ def test_a_slow_board_runs_between_its_frames_until_it_stops(bench: Start, until
 
 
 # Noise
-
-
-def test_a_burst_of_noise_is_taken_and_the_next_scan_goes_through(bench: Start) -> None:
-    b = bench()
-    b.tare()
-    b.skin.lines[0].say(random.Random(1).randbytes(1_000_000) + b"\x00")
-    assert b.step()["flags"] == []
-    (port,) = b.ask("status")["ports"]
-    assert port["corrupt"] > 1000
-    assert port["bytes"] > 1_000_000
 
 
 def test_a_device_that_does_not_listen_is_heard_all_the_same(

@@ -70,27 +70,6 @@ def test_what_waited_in_a_buffer_is_as_old_as_it_is(
         assert frame["age_ns"] >= frame["delay_ns"]
 
 
-@pytest.mark.slow
-def test_a_dual_scan_is_as_old_as_the_older_of_its_two(replay: Replay, tmp_path: Path) -> None:
-    path = recorded(tmp_path / "skew.mcap", structure_after_us=20_000)
-    frames = replay(path, lossless=True).of("map")
-    assert {frame["skew_ms"] for frame in frames} == {-20.0}
-    assert frames[-1]["delay_ns"] == pytest.approx(20e6, abs=1e5)
-    assert frames[-1]["flags"] == []
-
-
-@pytest.mark.slow
-def test_a_clock_that_stands_still_is_said_to_be_none(
-    replay: Replay, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    configure_logging("info", "text")  # to the captured stream
-    path = recorded(tmp_path / "still.mcap", device_us=lambda _: 7)
-    frames = replay(path, lossless=True).of("map")
-    assert {frame["dated_by"] for frame in frames} == {"arrival"}
-    assert {frame["delay_ns"] for frame in frames} == {0}
-    assert "device_clock_unusable" in capsys.readouterr().err
-
-
 def test_a_clock_that_jumps_is_said_to_have_jumped(
     replay: Replay, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

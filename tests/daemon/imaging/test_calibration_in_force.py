@@ -39,12 +39,6 @@ READINGS = [
 ]
 
 
-@pytest.fixture(autouse=True)
-def _own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
-
-
 def kept(path: Path | None = None, factor: float = 1.0, **changes: Any) -> PressureCalibration:
     """Keep a calibration of this sensor, whose pressures are by a factor higher, or of another."""
     subject = SUBJECT.model_copy(update=changes)

@@ -66,25 +66,6 @@ def dual(counter: int) -> Delivery:
     return Delivery(0, counter, tuple(scan(channel, counter, counter) for channel in BOTH))
 
 
-def test_the_newest_wins_where_frames_take_long() -> None:
-    frames = Frames()
-    pipeline = started(frames)
-    pipeline.deliver(dual(0))
-    wait_until(lambda: pipeline.tally()["received"] == 2 and pipeline.turns > 1, "the first frame")
-    for counter in range(1, 6):
-        pipeline.deliver(dual(counter))
-    held = pipeline.tally()  # one dual scan in hand, the others in the queue: each is counted
-    assert held == {**dict.fromkeys(held, 0), "received": 12, "waiting": 12}
-    frames.go.set()
-    wait_until(lambda: pipeline.tally()["waiting"] == 0, "all of them")
-    pipeline.stop()
-    assert frames.counters[-1] == 5
-    assert len(frames.counters) + pipeline.dropped == 6
-    assert pipeline.dropped >= 3
-    tally = pipeline.tally()
-    assert (tally["used"], tally["dropped"]) == (2 * len(frames.counters), 2 * pipeline.dropped)
-
-
 def test_what_overflows_is_counted_as_received_and_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "QUEUED_DELIVERIES", 3)
     frames = Frames()
@@ -101,18 +82,6 @@ def test_what_overflows_is_counted_as_received_and_dropped(monkeypatch: pytest.M
     wait_until(lambda: pipeline.tally()["waiting"] == 0, "all of them")
     pipeline.stop()
     assert len(frames.counters) + pipeline.dropped == 11
-
-
-def test_lossless_every_one_is_made() -> None:
-    frames = Frames()
-    frames.go.set()
-    pipeline = started(frames, lossless=True)
-    for counter in range(50):
-        pipeline.deliver(dual(counter))
-    wait_until(lambda: len(frames.counters) == 50, "all of them")
-    pipeline.stop()
-    assert frames.counters == list(range(50))
-    assert pipeline.dropped == 0
 
 
 def test_an_unpaced_replay_waits_for_the_slower_port() -> None:

@@ -72,17 +72,6 @@ def test_frames_become_scans_after_a_hello() -> None:
     assert (port.counts.packets, port.counts.corrupt) == (6 * 64, 0)
 
 
-@settings(max_examples=30)
-@given(st.lists(st.integers(1, 9000), max_size=40))
-def test_any_chunking_says_the_same(lengths: list[int]) -> None:
-    data, port, packets, at = stream(MESSAGES), Sciospec(TANK), list[Packet](), 0
-    for length in lengths:
-        packets += port.feed(data[at : at + length])
-        at += length
-    packets += port.feed(data[at:])
-    assert numbers(packets) == [1, 2, 3, 4, 5]
-
-
 @settings(max_examples=20)
 @given(st.integers(128, 6 * 64 - 1), st.binary(max_size=300))
 def test_what_is_lost_or_damaged_costs_its_frame_and_no_other(place: int, junk: bytes) -> None:

@@ -7,14 +7,6 @@ from tactomo.recordings.replay import ReplayClock
 from tactomo.scans import Delivery
 
 
-def test_unpaced_the_slowest_port_says_what_is_over() -> None:
-    clock = ReplayClock(2, is_paced=False)
-    assert clock.follow(Delivery(0, 5_000, ())) is None  # the other one was not heard yet
-    assert clock.follow(Delivery(1, 100, ())) == 100
-    assert clock.follow(Delivery(0, 9_000, ())) == 100
-    assert clock.follow(Delivery(1, 7_000, ())) == 7_000
-
-
 def test_a_port_at_its_end_holds_up_nobody() -> None:
     clock = ReplayClock(2, is_paced=False)
     clock.follow(Delivery(0, 5_000, ()))

@@ -32,10 +32,9 @@ def a_calibration(name: str, sensor: SensorDescription) -> PressureCalibration:
 
 
 def test_the_replay_of_a_pressed_skin_gives_the_same_maps(
-    bench: Start, replay: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bench: Start, replay: Start, tmp_path: Path
 ) -> None:
     """Also where another pressure calibration is put in force meanwhile."""
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     path = tmp_path / "pressed.mcap"
     sensor = load_description("paper_square")
     skin = SkinSimulator(sensor, spacing_m=0.004)  # on a coarser one discs look like rings

@@ -102,13 +102,6 @@ def test_nothing_is_left_after_a_start_that_failed(bench: Start, tmp_path: Path)
         os.close(descriptor)
 
 
-@pytest.mark.slow
-def test_the_log_says_that_the_skin_is_tared(spawn: Start) -> None:
-    process, _ = spawn()
-    wait_until(lambda: process.told("taring"), "taring")
-    assert process.told("taring")[0]["detail"] == "the first 3 dual scans become the reference"
-
-
 def test_a_sensor_of_one_channel_has_one_port() -> None:
     config = load_config(ports=("/dev/null", "/dev/zero"), description="graded_square")
     with pytest.raises(ConfigError, match="give one port"):

@@ -106,18 +106,6 @@ def test_under_journald_a_failure_to_start_is_an_error(
     assert re.search(rf"^<3>tactomo: .*{used_port}", said, re.M)
 
 
-@pytest.mark.slow
-def test_elsewhere_it_stays_json(
-    tmp_path: Path, make_skin: Callable[[Path, int], Any], used_port: int
-) -> None:
-    port, metrics = str(make_skin(tmp_path, 1).lines[0].path), f"metrics=127.0.0.1:{used_port}"
-    with daemon("--port", port, "--set", metrics, JOURNAL_STREAM="8:1") as process:
-        assert process.stderr is not None
-        said = process.stderr.read()
-    assert '"event": "loading"' in said
-    assert "<3>" not in said
-
-
 @pytest.fixture
 def used_port() -> Iterator[int]:
     """A TCP port of this computer that somebody listens at."""

@@ -104,19 +104,6 @@ def test_who_asks_a_lot_and_reads_the_answers_is_not_cut(daemon: DaemonProcess) 
 
 
 @pytest.mark.slow
-def test_a_few_parts_more_are_no_reason_to_be_silent(daemon: DaemonProcess) -> None:
-    dealer: Any = zmq.Context.instance().socket(zmq.DEALER)
-    dealer.setsockopt(zmq.LINGER, 0)
-    dealer.connect(daemon.control)
-    for _ in range(20):
-        dealer.send_multipart([b"x"] * 9)
-    dealer.send_multipart([b"", encode_request("status", {})])
-    assert dealer.poll(30_000)
-    assert decode_reply(dealer.recv_multipart()[1])["state"]
-    dealer.close()
-
-
-@pytest.mark.slow
 def test_a_flood_of_subscriptions_is_cut_and_the_stream_goes_on(bench: Callable[..., Any]) -> None:
     b = bench()
     b.tare()

@@ -21,6 +21,7 @@ import msgpack  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 import zenoh
+import zmq
 from hostile_page import SUBSCRIBE, post
 from logged_process import LoggedProcess, next_of
 from needs import need
@@ -136,11 +137,11 @@ def test_a_skin_at_rest_is_sent_by_a_heartbeat_and_a_touch_at_once(
 
 @pytest.mark.slow
 def test_a_status_is_sent_when_it_says_something_else_and_its_numbers_are_asked_for(
-    left: FakeSensor, start: Start, desk: zenoh.Session, reader: Any
+    left: FakeSensor, start: Start, desk: zenoh.Session, connect: Any
 ) -> None:
     samples = Samples(desk, "tactomo/arm/left/status")
     start(left, robot="arm")
-    one = reader(start(bind="tcp://127.0.0.1:0").address, topic("left", "status"))
+    one = connect(zmq.SUB, start(bind="tcp://127.0.0.1:0").address, topic("left", "status"))
     began_s, seen = time.monotonic(), set[int]()
     said: dict[str, Any] = {"state": "running", "frames": 0, "ports": [{"state": "running"}]}
     said["recording"] = {"path": "/data/grasp.mcap", "bytes": 0}
@@ -221,11 +222,12 @@ def test_a_token_lives_as_long_as_the_daemon(
 
 @pytest.mark.slow
 def test_clients_of_zeromq_find_all_skins_at_one_address(
-    left: FakeSensor, right: FakeSensor, start: Start, reader: Any
+    left: FakeSensor, right: FakeSensor, start: Start, connect: Any
 ) -> None:
     start(left, right, robot="arm")
     address = start(bind="tcp://127.0.0.1:0").address
-    every, one = reader(address, b""), reader(address, topic("right", "contacts"))
+    every = connect(zmq.SUB, address, b"")
+    one = connect(zmq.SUB, address, topic("right", "contacts"))
 
     def send() -> None:
         left.publish(TOUCH, map=np.ones((3, 3), np.float32))
@@ -248,15 +250,15 @@ def test_clients_of_zeromq_find_all_skins_at_one_address(
 
 
 def test_late_joiners_get_the_last_status_at_once(
-    left: FakeSensor, start: Start, reader: Any
+    left: FakeSensor, start: Start, connect: Any
 ) -> None:
     start(left, robot="arm")
     address = start(bind="tcp://127.0.0.1:0", robot="arm").address
-    first = reader(address, topic("left", "status"))
+    first = connect(zmq.SUB, address, topic("left", "status"))
 
     def is_repeated(prefix: bytes) -> bool:
         sent = next_of(first, lambda: left.publish_message("status", {"state": "running"}))
-        late = reader(address, prefix)
+        late = connect(zmq.SUB, address, prefix)
         # It is remembered for 3 s; a joiner whom a busy computer holds up for longer gets none.
         if not late.poll(2000):
             return False
@@ -271,22 +273,22 @@ def test_late_joiners_get_the_last_status_at_once(
 
 @pytest.mark.slow
 def test_a_status_of_a_daemon_that_is_gone_is_not_repeated(
-    desk: zenoh.Session, start: Start, reader: Any
+    desk: zenoh.Session, start: Start, connect: Any
 ) -> None:
     address = start(bind="tcp://127.0.0.1:0").address
-    first = reader(address, topic("left", "status"))
+    first = connect(zmq.SUB, address, topic("left", "status"))
     put = partial(desk.put, "tactomo/arm/left/status", b"\x80", attachment="1")
     wait_until(lambda: first.poll(0), meanwhile=put, step_s=0.02)
 
     def is_silent() -> bool:
-        with reader(address, topic("left", "status")) as late:
+        with connect(zmq.SUB, address, topic("left", "status")) as late:
             return not late.poll(500)
 
     wait_until(is_silent, "a status too old to be repeated")
 
 
 def test_zenoh_is_asked_for_what_somebody_wants_and_no_longer(
-    desk: zenoh.Session, start: Start, reader: Any
+    desk: zenoh.Session, start: Start, connect: Any
 ) -> None:
     publisher: Any = desk.declare_publisher("tactomo/arm/left/contacts")  # typed as not so
 
@@ -294,7 +296,7 @@ def test_zenoh_is_asked_for_what_somebody_wants_and_no_longer(
         return bool(publisher.matching_status.matching)
 
     address = start(bind="tcp://127.0.0.1:0").address
-    wanted = [reader(address, topic("left", "contacts")) for _ in range(2)]
+    wanted = [connect(zmq.SUB, address, topic("left", "contacts")) for _ in range(2)]
     wait_until(is_wanted, "a subscriber")
     for one in wanted:
         assert is_wanted()
@@ -303,16 +305,16 @@ def test_zenoh_is_asked_for_what_somebody_wants_and_no_longer(
 
 
 @pytest.mark.slow
-def test_a_slow_subscriber_slows_nobody(desk: zenoh.Session, start: Start, reader: Any) -> None:
+def test_a_slow_subscriber_slows_nobody(desk: zenoh.Session, start: Start, connect: Any) -> None:
     running = start(bind="tcp://127.0.0.1:0")
     counts, image = iter(range(1, 10_000)), bytes(640_000)
 
     def put() -> None:
         desk.put("tactomo/arm/left/map", image, attachment=str(next(counts)))
 
-    stalled = reader(running.address, topic("left", "map"))
+    stalled = connect(zmq.SUB, running.address, topic("left", "map"))
     wait_until(lambda: stalled.poll(0), meanwhile=put, step_s=0.02)  # and reads no more
-    healthy = reader(running.address, topic("left", "map"))
+    healthy = connect(zmq.SUB, running.address, topic("left", "map"))
     for _ in range(600):  # 384 MB: more than any buffer holds
         put()
         assert healthy.poll(PATIENCE_S * 1000)
@@ -334,20 +336,20 @@ def test_a_source_that_never_answered_is_missed_once(tmp_path: Path, start: Star
 
 
 def test_a_web_pages_subscription_gets_nothing(
-    desk: zenoh.Session, start: Start, reader: Any
+    desk: zenoh.Session, start: Start, connect: Any
 ) -> None:
     running = start(bind="tcp://127.0.0.1:0")
-    one = reader(running.address, b"left/")
+    one = connect(zmq.SUB, running.address, b"left/")
     put = partial(desk.put, "tactomo/arm/left/contacts", b"\x80", attachment="1")
     wait_until(lambda: one.poll(0), meanwhile=put, step_s=0.02)
     assert b"left" not in post(running.address, [SUBSCRIBE + b"left/"])
 
 
 def test_what_is_lost_is_counted_and_told(
-    desk: zenoh.Session, start: Start, reader: Any, left: FakeSensor
+    desk: zenoh.Session, start: Start, connect: Any, left: FakeSensor
 ) -> None:
     running = start(bind="tcp://127.0.0.1:0")
-    socket = reader(running.address, b"")
+    socket = connect(zmq.SUB, running.address, b"")
     key, body = "tactomo/arm/left/contacts", b"\x80"
     wait_until(
         lambda: socket.poll(0), meanwhile=lambda: desk.put(key, body, attachment="1"), step_s=0.02
@@ -359,10 +361,10 @@ def test_what_is_lost_is_counted_and_told(
 
 @pytest.mark.slow
 def test_two_robots_skins_of_one_name_are_not_mixed(
-    desk: zenoh.Session, start: Start, reader: Any, left: FakeSensor
+    desk: zenoh.Session, start: Start, connect: Any, left: FakeSensor
 ) -> None:
     running = start(bind="tcp://127.0.0.1:0")
-    one = reader(running.address, topic("left", "contacts"))
+    one = connect(zmq.SUB, running.address, topic("left", "contacts"))
     start(left, robot="arm")
     first = next_of(one, lambda: left.publish(TOUCH)).fields["session"]
     with FakeSensor("left") as other:

@@ -196,11 +196,6 @@ def made(subject: Subject) -> PressureCalibration:
     return PressureCalibration.of_readings(subject, Sensor(kinked, 0, 0.003, 0, 0).readings(8))
 
 
-@pytest.fixture(autouse=True)
-def _own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
-
-
 def test_what_is_kept_is_found_again(small: SensorDescription, made: PressureCalibration) -> None:
     assert calibration_for("left", small, None, pytest.fail) is None
     save_calibration(made, calibration_path("left"))
