@@ -8,7 +8,6 @@ chose a part of them, in its rows.
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Generator, Iterator
@@ -164,9 +163,3 @@ def busy() -> Iterator[Callable[[int], None]]:
     for loop in loops:
         loop.kill()
         loop.wait()
-
-
-@pytest.fixture
-def as_root() -> None:
-    if os.geteuid() != 0:
-        pytest.skip("only root may do this here")

@@ -370,27 +370,3 @@ def test_a_device_of_no_use(
     assert daemon.told(event)[0]["next_step"]
     assert min(reopened) >= 1
     assert back_s < BACK_S
-
-
-@pytest.mark.faults
-@pytest.mark.fault(
-    "The daemon started before its ports exist",
-    "the daemon reports that it waits, and publishes within 1.5 s of the ports' arrival, tare "
-    "included",
-    "wait_for_ports; the cables plugged in 3 s after `ready`; 100 dual scans/s",
-)
-def test_ports_that_come_later(
-    start: Start, skin: PtySkin, scenes: Scenes, listen: Listen, play: Play, figure: Figure
-) -> None:
-    skin.unplug()
-    daemon = start(skin.paths, wait_for_ports=True)
-    state = daemon.status()["state"]
-    ears = listen(daemon)
-    time.sleep(3.0)
-    skin.plug()
-    begin_s = time.monotonic()
-    play(still(scenes.rest), 100.0)
-    back_s = seconds_to_the_next_frame(ears, 0, begin_s)
-    figure(f"state before: {state}; first measured frame after {back_s:.2f} s, the tare included")
-    assert state == "waiting_for_port"
-    assert back_s < BACK_S + 0.5
