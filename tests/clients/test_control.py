@@ -14,24 +14,6 @@ from tactomo_client.control import TARE_TIMEOUT_S
 PATIENCE_S = 60.0
 
 
-def test_a_command_is_sent_and_its_result_returned() -> None:
-    with FakeControl({"set_tier": {"tier": "quiet"}}) as daemon:
-        assert request("set_tier", daemon.address, 10, tier="quiet") == {"tier": "quiet"}
-        assert daemon.requests == [("set_tier", {"tier": "quiet"})]
-
-
-def test_a_refusal_carries_cause_and_next_step() -> None:
-    refusal = ControlError("a contact is there", "lift it", "tare_refused")
-    with FakeControl({"tare": refusal}) as daemon, pytest.raises(ControlError) as caught:
-        request("tare", daemon.address, timeout_s=10)
-    error = caught.value
-    assert (error.name, error.cause, error.next_step) == (
-        "tare_refused",
-        "a contact is there",
-        "lift it",
-    )
-
-
 def test_silence_says_what_to_do() -> None:
     started = time.monotonic()
     with pytest.raises(ControlError, match=r"nothing answered at .* start the daemon") as caught:

@@ -16,7 +16,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +41,6 @@ from tactomo_client.messages import (
     CONTACTS,
     MAP,
     decode_message,
-    encode_message,
     frame_from_message,
 )
 from waiting import wait_until
@@ -203,20 +201,6 @@ def test_stale_while_the_daemon_is_gone_and_fresh_after_its_restart(
     assert second.stream == first.stream
     assert after["restarts"] == 1
     assert after["frame"]["session"] != before["frame"]["session"]
-
-
-@pytest.mark.slow
-def test_a_loop_of_1_khz_allocates_nothing_once_frames_come(
-    probe: Path, start: Callable[..., DaemonProcess], twin: Twin
-) -> None:
-    daemon = start()
-    request("press", twin.control, PATIENCE_S, x_mm=0.0, y_mm=0.0)
-    for kind in (CONTACTS, MAP):
-        did = json.loads(run(probe, "loop", SENSOR, daemon.stream, kind, 3000))
-        assert did["counts"]
-        assert did["frames"] > 5
-        assert did["before_first"] > 0
-        assert did["after_first"] == 0
 
 
 @pytest.mark.slow
@@ -598,30 +582,6 @@ def test_both_clients_agree_on_what_is_a_frame(checked: Path, kind: str) -> None
             wanted = {**wanted, **{name: wanted[name] or None for name in texts}}
         assert got == wanted, (outcome.get("problem"), msgpack.unpackb(message[len(head) :]))
     assert 300 < accepted < 2700
-
-
-def shows(sequence: int, said: dict[str, Any]) -> bool:
-    return bool(said["frame"] and said["frame"]["sequence"] == sequence)
-
-
-# A publisher leaves out what a subscriber's queue of 1000 cannot hold.
-FEWER_THAN_A_QUEUE = 250
-
-
-@pytest.mark.slow
-def test_garbage_over_a_socket_is_skipped(sensor: FakeSensor, checked: Path) -> None:
-    dice = random.Random(5)
-    whole = encode_message("left", MAP, examples()[MAP])
-    deep, wide = b"\x81\xa1a" + b"\x91" * 100_000, b"\xdf\xff\xff\xff\xff"
-    with Watch(checked, "left", sensor.address, "map") as skin:
-        assert sensor.wait_for_subscriber(PATIENCE_S) == b"left/map\0"
-        garbage = [b"", deep, wide, *(corrupted(whole[9:], dice) for _ in range(1000))]
-        for first in range(0, len(garbage), FEWER_THAN_A_QUEUE):
-            for each in garbage[first : first + FEWER_THAN_A_QUEUE]:
-                sensor.send(b"left/map\0" + each)
-            sensor.publish(sequence=9_000 + first)
-            seen = skin.wait(partial(shows, 9_000 + first), "the whole one")
-    assert seen["malformed"] > 200
 
 
 @pytest.mark.slow

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
 from typing import Any
 
 import pytest
+from tables import table
 from tactomo_models import SensorDescription
 
-PAGE = (Path(__file__).parents[2] / "docs" / "sensor_description.md").read_text("utf-8")
 SCHEMA = SensorDescription.model_json_schema(by_alias=True)
 TABLES = {
     "At the top": "",
@@ -27,16 +25,6 @@ TABLES = {
     "`[mount.cylinder]`": "CylinderMount",
     "`[mount.surface]`": "SurfaceMount",
 }
-
-
-def rows(heading: str) -> dict[str, list[str]]:
-    """Return the cells of each row of the table under a heading, by the key in its first cell."""
-    after = PAGE.partition(f"\n## {heading}\n")[2]
-    assert after, f"there is no {heading!r}"
-    table = re.search(r"^\| Key .*\n\|[-|]+\n((?:\|.*\n)+)", after, re.M)
-    assert table
-    cells = [[cell.strip() for cell in row.split("|")[1:-1]] for row in table[1].splitlines()]
-    return {row[0].strip("`"): row[1:] for row in cells}
 
 
 def single(field: dict[str, Any]) -> dict[str, Any]:
@@ -63,10 +51,10 @@ def test_every_key_has_its_row(heading: str, name: str) -> None:
         for key, field in schema["properties"].items()
         if "$ref" not in str(single(field)) and "const" not in field
     }
-    told = rows(heading)
+    told = table("docs/sensor_description.md", f"## {heading}", "Key")
     assert told.keys() - {"schema"} == fields.keys()
     for key, field in fields.items():
-        _, _, span, default, since, meaning = told[key]
+        _, _, _, span, default, since, meaning = told[key].values()
         assert span == range_of(field) or not range_of(field), key
         required = key in schema.get("required", ())
         given = field.get("default")

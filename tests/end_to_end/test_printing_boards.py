@@ -61,18 +61,3 @@ def test_a_press_on_an_emulated_board_is_where_it_is(
     assert math.hypot(contact.x_mm - 18.0, contact.y_mm + 14.0) < 2.0
     [port] = daemon.status()["ports"]
     assert port["corrupt"] == 0
-
-
-@pytest.mark.slow
-def test_it_stands_what_happens_to_a_cable(start: Start, tmp_path: Path) -> None:
-    board = changed(tmp_path, "matrix_disc")
-    twin, daemon = start("matrix", board)
-    tared(daemon)
-    request("garbage", twin.control, PATIENCE_S, count=3000)
-    wait_until(lambda: daemon.status()["ports"][0]["corrupt"] > 0, "damage that is counted")
-    request("unplug", twin.control, PATIENCE_S)
-    wait_until(lambda: daemon.told("port_lost"), "a lost port")
-    request("replug", twin.control, PATIENCE_S)
-    wait_until(lambda: daemon.told("port_back"), "the port again")
-    press(twin, -20.0, 10.0)
-    frame_where(daemon, lambda frame: len(frame.contacts) == 1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import signal
 import subprocess
 import sys
@@ -154,36 +153,6 @@ def test_a_played_stream_gives_what_its_import_gives(start: Start, tmp_path: Pat
     moving = ours[-125:-55]
     angle = np.unwrap([math.atan2(f.contacts[0].y_mm, f.contacts[0].x_mm) for f in moving])
     assert angle[-1] - angle[0] > math.pi  # around the tank, counter-clockwise
-
-
-@pytest.mark.long
-def test_each_labelled_object_lies_beside_its_electrode(start: Start, tmp_path: Path) -> None:
-    """Metal and plastic that stood beside electrodes 1, 5, 9 and 13 of a tank."""
-    tank = changed(
-        tmp_path,
-        TANK,
-        ("conductivity_ratio = 0.01", "conductivity_ratio = 30\neither_way = true"),
-    )
-    with np.load(measured("tank_labelled.npz")) as sets:
-        names, rest, there = sets["name"], sets["reference"], sets["target"]
-    number = next(n for n, name in enumerate(names) if "electrode13" in name and "60uA" in name)
-    turn = np.exp(-0.5j * np.angle(np.sum(rest[number] ** 2)))
-    turn *= -np.sign((rest[number] * turn).real[0])  # as the model has that voltage
-    still = np.repeat([(each[number] * turn).real for each in (rest, there)], 60, axis=0)
-    noise = np.random.default_rng(0).normal(scale=2e-4, size=still.shape)
-    skin = MeasuredSkin(still + noise * np.abs(still).max())
-    _, daemon = start(tank, None, skin, noise_v=0.0, rate_hz=20.0)
-    wait_until(lambda: daemon.told("tared"), "a reference")
-    first = frame_where(daemon, lambda frame: len(frame.contacts) > 1)
-    frame = frame_where(daemon, lambda f: f.sequence > first.sequence + 5 and len(f.contacts) > 1)
-    assert frame.structure is not None
-    x, y = np.meshgrid(np.linspace(-1, 1, 25), np.linspace(-1, 1, 25))
-    for named, kind in re.findall(r"electrode(\d+)_(metal|plastic)", str(names[number])):
-        angle = math.radians(-90 + (int(named) - 1) * 22.5)
-        near = np.hypot(x - 0.7 * math.cos(angle), y - 0.7 * math.sin(angle)) < 0.25
-        seen = np.nan_to_num(frame.structure[near])
-        strongest = seen[np.abs(seen).argmax()]
-        assert (strongest > 0.15) if kind == "metal" else (strongest < -0.15), named
 
 
 def scans(path: Path) -> list[np.ndarray[Any, np.dtype[np.float32]]]:

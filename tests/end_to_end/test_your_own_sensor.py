@@ -10,21 +10,13 @@ import re
 import tomllib
 from pathlib import Path
 
-import numpy as np
 import pytest
-from faulty_skin import rewired
 from newcomer import Newcomer
 from page import Page
 from tactomo.acquisition.port import contradiction
 from tactomo_models import (
     DescriptionError,
-    Flag,
-    Press,
-    Reconstruction,
-    Reconstructor,
-    Reference,
     SensorDescription,
-    SkinSimulator,
     load_description,
 )
 from tactomo_models.sensor.outline import Pad
@@ -181,42 +173,3 @@ def test_a_device_of_another_pattern_is_refused_in_the_pages_words(tmp_path: Pat
     both = (Channel.MAGNITUDE, Channel.STRUCTURE)
     round_ = Hello("twin-skin_round", "1", both, 16, 8, 1, 192, SampleFormat.INT32, 1.0, 20.0)
     assert contradiction(round_, load_description(tmp_path / FILE)) in PAGE.text
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("order", "flagged", "place_mm"),
-    [
-        ([(4 - lead) % 16 for lead in range(16)], False, (-30, 20)),  # clockwise, from electrode 4
-        ([(lead + 8) % 16 for lead in range(16)], False, (-30, -20)),  # turned by half a turn
-        ([-lead % 16 for lead in range(16)], True, None),  # clockwise, from electrode 0
-        ([(lead + 1) % 16 for lead in range(16)], True, None),
-    ],
-)
-def test_a_wrong_numbering_is_seen_as_the_page_says(
-    tmp_path: Path, order: list[int], flagged: bool, place_mm: tuple[float, float] | None
-) -> None:
-    (tmp_path / FILE).write_text(PAGE.file(FILE))
-    sensor = load_description(tmp_path / FILE)
-    skin = rewired(SkinSimulator(sensor, unevenness=0.03, impedance_spread=0.1), order)
-    frame = _pressed(sensor, skin)
-    assert bool(frame.flags & Flag.REFERENCE_MISMATCH) == flagged
-    if place_mm is not None:
-        (contact,) = frame.contacts
-        assert (1e3 * contact.x_m, 1e3 * contact.y_m) == pytest.approx(place_mm, abs=1)
-
-
-def _pressed(sensor: SensorDescription, skin: SkinSimulator) -> Reconstruction:
-    """A frame of a press at (30, 20) mm."""
-    rest, pressed = dict(skin.voltages([])), skin.voltages([Press(0.03, 0.02, 250.0, 0.01)])
-    noise_v = 2.5e-4 * max(float(np.abs(volts).max()) for volts in rest.values())
-    noise = np.full(sensor.measurements, noise_v)
-    reconstructor = Reconstructor(sensor, method="fit")
-    reconstructor.set_reference(
-        Reference(rest[Channel.MAGNITUDE], rest[Channel.STRUCTURE], noise, noise, 20)
-    )
-    rng = np.random.default_rng(0)
-    noisy = {
-        name: volts + noise * rng.standard_normal(len(volts)) for name, volts in pressed.items()
-    }
-    return reconstructor.reconstruct(noisy[Channel.MAGNITUDE], noisy[Channel.STRUCTURE])

@@ -226,34 +226,6 @@ A, B, C = (
 )
 
 
-@pytest.mark.parametrize(
-    ("stream", "decoded"),
-    [
-        (encode(A)[:-1] + encode(B) + encode(C), [A, B, C]),
-        (encode(A) + encode(B)[1:] + encode(C), [A, B, C]),
-        (encode(A)[:-1] + encode(B)[1:] + encode(C), [C]),
-        (encode(A) + b"\x07junk" + encode(B) + encode(C), [A, B, C]),
-        (encode(A) + b"\x07ju\0nk" + encode(B) + encode(C), [A, B, C]),
-        (encode(A) + b"\x01" * 20_000 + encode(B) + encode(C), [A, B, C]),
-        (encode(A)[:-4] + encode(B) + encode(C), [B, C]),
-        (encode(A)[1:] + encode(B) + encode(C), [B, C]),
-    ],
-    ids=[
-        "trailing delimiter deleted",
-        "leading delimiter deleted",
-        "both delimiters between two frames deleted",
-        "garbage between two frames",
-        "garbage with a zero between two frames",
-        "garbage longer than a frame between two frames",
-        "end of a frame deleted",
-        "first delimiter of all deleted",
-    ],
-)
-def test_damage_at_delimiters(stream: bytes, decoded: list[Packet]) -> None:
-    """The corner cases of the property above, by name."""
-    assert Decoder().feed(stream) == decoded
-
-
 def test_every_single_byte_error_costs_that_packet_alone() -> None:
     before, hit, after = encode(A), encode(B), encode(C)
     for at, right in enumerate(hit):

@@ -33,15 +33,6 @@ def test_noise_has_the_stated_size_on_every_measurement() -> None:
     assert abs(np.corrcoef(errors[:-1].ravel(), errors[1:].ravel())[0, 1]) < 0.02
 
 
-def test_equal_seeds_give_equal_scans_in_any_order() -> None:
-    def scans(seed: int, counters: list[int]) -> dict[int, list[float]]:
-        converter = Converter(1.0, 1e-3, seed)
-        return {n: list(volts_of(converter, n)) for n in counters}
-
-    assert scans(7, [0, 50, 100]) == scans(7, [100, 0, 50])
-    assert scans(7, [0]) != scans(8, [0])
-
-
 def test_the_channels_have_noise_of_their_own() -> None:
     converter = Converter(1.0, 1e-3)
     assert not np.array_equal(volts_of(converter), volts_of(converter, channel=Channel.STRUCTURE))

@@ -19,7 +19,6 @@ from tactomo_models import SkinSimulator, load_description
 
 QUICK: Final = {
     "info": ("boastful.npz", "crowd.eit", "markup.mcap", "marks.mcap", "pipe.csv"),
-    "plot": ("timeless.mcap",),
     "replay": ("piped.mcap",),
     "reconstruct": ("pipe.npz",),
 }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from shared_data import measured
 from tactomo.recordings.recording import Recording, open_recording
 from tactomo_models import load_description
 from tactomo_models.arrays import FloatArray
@@ -316,32 +314,3 @@ def test_an_existing_recording_is_not_overwritten(tactomo: Run, tmp_path: Path) 
     assert result.returncode == 1
     assert "exists already" in result.stderr
     assert (tmp_path / "out.mcap").read_text() == "precious"
-
-
-def test_info_of_an_imported_recording(tactomo: Run, tmp_path: Path) -> None:
-    np.savez(tmp_path / "in.npz", magnitude=np.ones((4, 208)))
-    tactomo("import", "in.npz", "out.mcap", "--rate", "10")
-    facts = json.loads(tactomo("info", "out.mcap", "--json").stdout)
-    assert facts["scans"] == {"magnitude": 4}
-    assert facts["seconds"] == pytest.approx(0.3)
-    assert facts["complete"] is True
-    assert "magnitude: 4" in tactomo("info", "out.mcap").stdout
-
-
-def test_a_measured_tank(tactomo: Run, tmp_path: Path) -> None:
-    result = tactomo(
-        *(
-            "import",
-            measured("tank_sciospec_20fps.npz"),
-            "tank.mcap",
-            "--description",
-            "tank_disc",
-            "--reference-frames",
-            "0:20",
-        )
-    )
-    assert result.returncode == 0, result.stderr
-    read = scans(open_recording(tmp_path / "tank.mcap"))
-    assert len(read) == 255
-    # Every adjacent voltage of an empty round tank has the sign of the current's way back.
-    assert np.all(read[0][1].samples < 0)

@@ -12,14 +12,11 @@ from pathlib import Path
 from typing import IO, Any
 
 import pytest
-import serial
 from processes import children_of, is_running
 from tactomo.cli import app
 from tactomo.cli.children import ChildError, Family
 from tactomo.twin import TwinConfig
-from tactomo_client import request
 from tactomo_models import load_description
-from tactomo_protocol import Command, CommandCode, Decoder, Scan, encode
 from typer.main import get_command
 from waiting import PATIENCE_S, wait_until
 
@@ -61,30 +58,6 @@ def announced(stream: IO[str] | None) -> dict[str, Any]:
             fields: dict[str, Any] = json.loads(line)
             return fields
     raise AssertionError("".join(seen))
-
-
-@pytest.mark.slow
-def test_a_twin_of_the_papers_sensor(start: Run, tmp_path: Path) -> None:
-    twin = start(
-        *("twin", "--ports", 1, "--link", "dev", "--twin-control", "tcp://127.0.0.1:0"),
-        "--announce",
-    )
-    ready = announced(twin.stdout)
-    assert ready["ports"] == ["dev/skin"]
-    decoder, scans = Decoder(), list[Scan]()
-    with serial.Serial(str(tmp_path / "dev" / "skin"), timeout=0.1) as port:
-        port.write(encode(Command(CommandCode.START, 1)))
-
-        def six_scans() -> bool:
-            scans.extend(p for p in decoder.feed(port.read(4096)) if isinstance(p, Scan))
-            return len(scans) >= 6
-
-        wait_until(six_scans)
-    assert {len(scan.samples) for scan in scans} == {208}
-    assert request("status", ready["control"], PATIENCE_S)["sensor"] == "paper_square"
-    twin.send_signal(signal.SIGHUP)
-    assert twin.wait(PATIENCE_S) == 0
-    assert not os.path.lexists(tmp_path / "dev" / "skin")
 
 
 def test_a_twin_whose_control_address_is_taken_says_what_to_do(tactomo: Run, control: Any) -> None:

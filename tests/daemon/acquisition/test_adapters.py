@@ -7,7 +7,6 @@ import pty
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -166,11 +165,6 @@ def test_an_adapter_may_go_while_it_is_looked_at(machine: FakeMachine) -> None:
     assert list_adapters(machine.root) == []
 
 
-def test_this_machine_is_read_without_complaint() -> None:
-    for adapter in list_adapters():
-        assert os.path.exists(adapter.path)
-
-
 @pytest.mark.parametrize(("timer_ms", "is_told"), [(16, True), (1, False), (None, False)])
 def test_a_latency_timer_that_stays_long_is_told(
     machine: FakeMachine, line: Any, timer_ms: int | None, is_told: bool
@@ -189,10 +183,6 @@ def test_a_latency_timer_that_stays_long_is_told(
     assert connection.latency_timer_ms == latency_timer_ms(str(line.path), machine.root) == timer_ms
     assert [event.partition(":")[0] for event in told] == ["latency_timer"] * is_told
     assert all("16 ms" in event and "latency_timer" in event for event in told)
-
-
-def test_a_port_says_its_latency_timer_in_status(bench: Callable[..., Any]) -> None:
-    assert bench().ask("status")["ports"][0]["latency_timer_ms"] is None
 
 
 # Opens pseudo-terminals of its own until one has the wanted name, as in a container, and gives that

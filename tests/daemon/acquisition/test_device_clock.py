@@ -216,16 +216,6 @@ def test_a_year_of_microseconds_is_as_good_as_a_minute() -> None:
     assert seen.within_ms(1.0) < 1.0
 
 
-def test_two_channels_of_one_device_are_one_clock() -> None:
-    clock = DeviceClock()
-    for number in range(400):
-        arrived_ns = BOOT_NS + number * 50_000_000
-        for channel, after_us in ((Channel.STRUCTURE, 20_000), (MAGNITUDE, 0)):
-            late_ns = clock.date(channel, number * 50_000 + after_us, arrived_ns)
-    assert clock.state is ClockState.SETTLED
-    assert late_ns == 20_000_000  # it was taken 20 ms before the other and came with it
-
-
 @given(
     st.lists(
         st.tuples(st.integers(0, 2**64 - 1), st.integers(0, 4_000_000_000)), min_size=1, max_size=80

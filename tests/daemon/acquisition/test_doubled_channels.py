@@ -46,24 +46,6 @@ def test_a_port_whose_channels_another_one_carries_is_refused_and_told(bench: St
     assert b.step()["flags"] == []
 
 
-def test_many_hellos_of_the_refused_skin_are_one_event(bench: Start) -> None:
-    b = two_skins(bench)
-    for _ in range(50):
-        b.skin.lines[1].say(b.skin.lines[1].hello)
-    b.step()
-    assert sum(event["name"] == "device_refused" for event in b.listener.of("event")) == 1
-
-
-def test_hellos_of_changing_devices_are_told_now_and_then(bench: Start) -> None:
-    b = bench()
-    b.tare()
-    [line] = b.skin.lines
-    for number in range(50):
-        line.say(replace(line.hello, device_id=f"board-{number}"))
-    b.step()
-    assert 1 <= sum(event["name"] == "device_changed" for event in b.listener.of("event")) <= 5
-
-
 def test_a_board_that_moves_to_the_other_port_takes_its_channel_along(bench: Start) -> None:
     b = bench(ports=2)
     for line, name in zip(b.skin.lines, ("one", "other"), strict=True):

@@ -64,32 +64,6 @@ def test_every_scan_is_joined_sent_alone_or_counted_once(
         assert {single.counter for single in dual.scans} == {dual.counter}
 
 
-@given(st.lists(st.tuples(st.booleans(), st.booleans(), st.booleans()), max_size=60))
-def test_what_comes_in_time_is_joined_and_stays_in_order(
-    instants: list[tuple[bool, bool, bool]],
-) -> None:
-    """Each instant, either channel may be lost on the way and either may come first."""
-    sync = CounterPairer(BOTH, WAIT_NS)
-    sent: list[DualScan] = []
-    for counter, (has_magnitude, has_structure, magnitude_first) in enumerate(instants):
-        now_ns = counter * 50_000_000
-        sent += sync.advance(now_ns)
-        present = [
-            c for c, there in zip(BOTH, (has_magnitude, has_structure), strict=True) if there
-        ]
-        for channel in present if magnitude_first else reversed(present):
-            sent += sync.push(scan(channel, counter, now_ns))
-    sent += sync.finish()
-
-    assert [dual.counter for dual in sent] == [
-        counter for counter, (m, s, _) in enumerate(instants) if m or s
-    ]
-    # Those whose channels were both there before are joined; a lost channel may cost one pair.
-    joined = sum(len(dual.scans) == 2 for dual in sent)
-    whole = sum(m and s for m, s, _ in instants)
-    assert whole - sync.late == joined
-
-
 class Instant(NamedTuple):
     """One dual scan as it was taken, and what becomes of each channel's scan of it."""
 
@@ -161,14 +135,6 @@ def feed(sync: CounterPairer, *scans: ChannelScan) -> list[list[int]]:
     for one in scans:
         sent += sync.advance(one.clock_ns) + sync.push(one)
     return [[one.counter for one in dual.scans] for dual in sent]
-
-
-def test_a_port_that_lags_by_five_scans_is_waited_for() -> None:
-    magnitudes = [scan(BOTH[0], n, n * 1_000_000, n * 1000) for n in range(1, 6)]
-    structures = [scan(BOTH[1], n, 6_000_000, n * 1000) for n in range(1, 6)]
-    sync = CounterPairer(BOTH, WAIT_NS)
-    assert feed(sync, *magnitudes, *structures) == [[n, n] for n in range(1, 6)]
-    assert sync.late == 0
 
 
 def test_counters_that_are_zeroed_while_one_port_lags_stay_paired() -> None:

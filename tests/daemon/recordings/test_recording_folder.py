@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from daemon_bench import maps_of, scan_counters
 from tactomo.config import RecordingConfig
-from tactomo.errors import RecordingError
 from tactomo.recordings import recorder
 from tactomo.recordings.recording import Origin, open_recording
 from tactomo.recordings.recording_writer import RecordingWriter
@@ -62,11 +61,6 @@ def test_each_file_replays_alone_and_together_they_have_every_frame_once(
     for channel in Channel:
         assert {c for path in files for c in scan_counters(path, channel)} == set(again)
     assert rotated == len(files) - 1 >= 3
-
-
-def test_a_folder_is_no_recording(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"no regular file; give the path of a \.mcap file"):
-        open_recording(tmp_path)
 
 
 def test_numbers_go_on_whatever_the_clock_and_strangers_do(bench: Start, tmp_path: Path) -> None:

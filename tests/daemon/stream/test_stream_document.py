@@ -31,12 +31,8 @@ DOCUMENT = (DOCUMENT_FOLDER / "STREAM.md").read_text("utf-8")
 
 def table(heading: str, column: str = "Name") -> set[str]:
     """Return the names in the first column of the first such table after a heading or a word."""
-    after = DOCUMENT.partition(f"\n{heading}\n")[2]
-    assert after, f"STREAM.md has no {heading!r}"
-    rows = re.search(rf"^\| {column} \|.*\n\|[-|]+\n((?:\|.*\n)+)", after, re.M)
-    assert rows, f"STREAM.md has no table of {column} after {heading!r}"
-    firsts = [row.split("|")[1] for row in rows[1].splitlines()]
-    return {name for first in firsts for name in re.findall(r"`(\w+)`", first)}
+    firsts = cells_of("clients/STREAM.md", heading, column)
+    return {name for first in firsts for name in re.findall(r"\w+", first)}
 
 
 def of_status(heading: str) -> dict[str, str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import skfem
 from hypothesis import given
 from hypothesis import strategies as st
 from pyeit.eit import fem, protocol  # type: ignore[import-untyped]
@@ -105,16 +104,6 @@ def solve_directly(model: ForwardModel, sheet: SheetMesh, change: FloatArray) ->
     )
 
 
-def test_a_pressed_sheet_equals_a_solve_of_the_whole_system(
-    sheet: SheetMesh, model: ForwardModel
-) -> None:
-    all_over = np.full(len(model.bare.pressable), 4.0)
-    for change in (*(bump(model, contrast) for contrast in (1.2, 100.0, 0.01)), all_over):
-        pressed = model.solve(change).voltages
-        np.testing.assert_allclose(pressed, solve_directly(model, sheet, change), rtol=1e-8)
-        assert np.abs(pressed / model.bare_voltages - 1).max() > 0.01
-
-
 def test_an_uneven_sheet_leaves_no_more_to_be_solved(
     model: ForwardModel, uneven: ForwardModel
 ) -> None:
@@ -175,33 +164,6 @@ def test_a_larger_sheet_leaves_as_much_to_be_solved(small: SensorDescription) ->
         unknowns.append((len(solution.rim), len(solution.nodes)))
     assert unknowns[0] == unknowns[1]
     assert unknowns[0][0] < 0.5 * unknowns[0][1]
-
-
-def test_reciprocity_holds_to_rounding(model: ForwardModel, small: SensorDescription) -> None:
-    pairs = small.pairs
-    voltages = model.solve(bump(model, 100.0)).voltages
-    by_pair = {
-        (*d, *m): v
-        for d, m, v in zip(pairs.drive.tolist(), pairs.measure.tolist(), voltages, strict=True)
-    }
-    for (a, b, c, d), value in by_pair.items():
-        assert by_pair[c, d, a, b] == pytest.approx(value, rel=1e-9)
-
-
-@pytest.mark.parametrize("name", ["paper_square", "tank_disc"])
-def test_electrodes_have_their_length_and_the_sheet_its_area(name: str) -> None:
-    description = load_description(name)
-    sheet = mesh_sheet(description)
-    mesh = sheet.mesh
-    for facets in sheet.electrode_facets:
-        ends = mesh.facets[:, facets]
-        length = np.linalg.norm(mesh.p[:, ends[0]] - mesh.p[:, ends[1]], axis=0).sum()
-        assert length == pytest.approx(description.electrodes.length_m, rel=2e-3)
-    ones = skfem.Functional(lambda w: 1.0 + 0 * w.x[0])
-    area = ones.assemble(skfem.Basis(mesh, skfem.ElementTriP1()))
-    width = description.width_m
-    expected = np.pi * width**2 / 4 if name == "tank_disc" else width * description.height_m
-    assert area == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -292,12 +254,6 @@ def test_a_solve_does_not_depend_on_the_one_before(model: ForwardModel) -> None:
         after = model.solve(change)
         np.testing.assert_array_equal(after.voltages, alone.voltages)
         np.testing.assert_array_equal(after.potentials, alone.potentials)
-
-
-def test_nothing_pressed_is_the_bare_sheet(model: ForwardModel) -> None:
-    np.testing.assert_array_equal(
-        model.solve(np.zeros(len(model.bare.pressable))).voltages, model.bare_voltages
-    )
 
 
 def test_the_frame_cannot_be_pressed(paper: SensorDescription, artifact: Artifact) -> None:
