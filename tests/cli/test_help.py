@@ -161,7 +161,7 @@ def test_without_the_laboratory_it_says_how_to_get_it(
     tactomo: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(commands, "_entry_points", dict)
-    for words in (["evaluate", "scenes"], ["models", "train"]):
+    for words in (["evaluate", "field"], ["models", "train"]):
         result = tactomo(*words)
         assert result.returncode == 1
         assert "is part of the laboratory, which is not installed" in result.stderr

@@ -140,5 +140,5 @@ def test_what_the_service_needs_is_there(robot: Path, home: Path) -> None:
 def test_the_laboratory_evaluates(wheels: dict[str, Path], home: Path) -> None:
     ours = ("tactomo", "tactomo_client", "tactomo_lab")
     tactomo = installed(home / "env", *(wheels[name] for name in ours)) / "tactomo"
-    scenes = ("evaluate", "scenes", "--count", "1", "--contacts", "1")
+    scenes = ("evaluate", "field", "--rows", "ordinary", "--count", "1")
     assert "cnn-single" in run(tactomo, *scenes, "--method", "cnn-single", folder=home)

@@ -20,7 +20,7 @@ FILES = ("own_method.py", "float_board.py")
 RUN_AT_ONCE = ("Arrays in", "What a frame says", "Methods")
 METHOD, PROTOCOL = "A method of your own", "A device protocol of your own"
 SMALLER = {
-    "--count 2 --contacts 1-4": "--count 1 --contacts 1",
+    "--count 8": "--count 1",
     "--method tikhonov --count 2": "--count 1",
 }
 

@@ -24,7 +24,7 @@ from tactomo_protocol import Channel, Hello, SampleFormat
 
 PAGE = Page("docs/your_own_sensor.md")
 FILE = "my_sheet.toml"
-SMALLER = {"--count 5 --contacts 1-4": "--count 1 --contacts 1", "--seconds 3": "--seconds 1"}
+SMALLER = {"--count 20": "--count 1", "--seconds 3": "--seconds 1"}
 SHORTER = {"--seconds 5": "--seconds 1", "doctor ": "doctor --seconds 2 "}
 
 

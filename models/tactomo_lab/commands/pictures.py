@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tactomo.cli.plot.plot import save_figure
-from tactomo_models.scene.press import strongest
 
 from tactomo_lab.scenes.measures import mean
 
@@ -18,7 +16,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from tactomo_models import SensorDescription
 
-    from tactomo_lab.evaluation.drifting import Day, Seen
     from tactomo_lab.evaluation.play import Outcome
     from tactomo_lab.scenes.measures import Score
 
@@ -54,7 +51,7 @@ def draw_outcomes(outcomes: Sequence[Outcome], output: Path) -> None:
 
 
 def _draw_outcome(axes: Any, outcome: Outcome) -> None:
-    score, truth, frame = outcome.score, outcome.case.truth, outcome.made
+    score, truth, frame = outcome.score, outcome.case.truth_of(outcome.frame), outcome.made
     top = max(truth.map.max(), 0.0 if frame.map is None else float(frame.map.max()))
     sensor = outcome.case.description
     images = (
@@ -73,46 +70,6 @@ def _draw_outcome(axes: Any, outcome: Outcome) -> None:
     for contact in frame.contacts:
         axes[1].plot(contact.x_m * 1e3, contact.y_m * 1e3, "r+", markersize=6)
     axes[2].set_xlabel("\n".join(score.flags), fontsize=6, color="tab:red")
-
-
-def draw_press(
-    outcome: Outcome,  # of a scene of one contact
-    output: Path,  # the picture
-) -> None:
-    """Draw one contact: the truth, what a method found, and a cut through both in kPa.
-
-    Raises TactomoError where the picture cannot be written.
-    """
-    from matplotlib.figure import Figure
-
-    case, frame = outcome.case, outcome.made
-    (press,) = outcome.frame.presses.values()
-    sensor, truth = case.description, case.truth
-    figure = Figure(figsize=(11.5, 4), layout="constrained")
-    axes: Any = figure.subplots(1, 3)
-    maps = (truth.map, frame.map)
-    highest = max(float(image.max()) for image in maps if image is not None)
-    peaks = [f"{c.peak_kpa:.0f} ± {c.peak_sigma_kpa:.0f} kPa" for c in frame.contacts]
-    titles = (
-        f"truth, {case.name}, {_size_mm(sensor)}\npeak {press.pressure_kpa:.0f} kPa",
-        f"{outcome.method}, correlation {outcome.score.icc:.3f}\npeak {', '.join(peaks) or 'none'}",
-    )
-    for panel, image, title in zip(axes, maps, titles, strict=False):
-        panel.set_title(title, fontsize=10)
-        drawn = _show(panel, image, sensor, highest)
-        panel.axhline(press.y_m * 1e3, color="white", linestyle=":", linewidth=1)
-    figure.colorbar(drawn, ax=axes[:2], shrink=0.8, pad=0.01, label=CHANGE)
-    x = np.linspace(press.x_m - 0.03, press.x_m + 0.03, 301)
-    pressure, coverage = strongest([press], x, np.full_like(x, press.y_m), edge_m=1e-9)
-    axes[2].plot(x * 1e3, pressure * coverage, "k", label="truth")
-    row = int(np.argmin(np.abs(sensor.map_y_m - press.y_m)))
-    if frame.pressure_kpa is not None:
-        axes[2].plot(sensor.map_x_m * 1e3, frame.pressure_kpa[row], label=outcome.method)
-    axes[2].set(xlim=(x[0] * 1e3, x[-1] * 1e3), ylim=(0, None), xlabel="x (mm)")
-    axes[2].set_ylim(top=1.3 * axes[2].get_ylim()[1])  # the legend above the curves
-    axes[2].set_title("pressure along the dotted line (kPa)", fontsize=10)
-    axes[2].legend(fontsize=8, loc="upper center")
-    save_figure(figure, output)
 
 
 def draw_overview(
@@ -156,41 +113,6 @@ def draw_overview(
 def _mark(axes: Any, x: float, y: float, words: str) -> None:
     box = {"facecolor": "tab:red", "edgecolor": "none", "pad": 1.5}
     axes.text(x, y, words, va="center", ha="right", fontsize=8, color="white", bbox=box)
-
-
-def draw_day(day: Day, seen: dict[str, list[Seen]], output: Path) -> None:
-    """Draw the drift and how it is followed, and what is shown tracked and untracked."""
-    from matplotlib.figure import Figure
-
-    tracked, untracked = seen.values()
-    figure = Figure(figsize=(11, 6.5), layout="constrained")
-    axes: Any = figure.subplots(3, 1, sharex=True, height_ratios=(2, 2, 1.6))
-    hours = np.array([each.time_s / 3600 for each in tracked])
-    true = [100 * math.expm1(-day.drift(each.time_s).warming(each.time_s)) for each in tracked]
-    axes[0].plot(hours, true, color="0.6", lw=4, label="of the sheet, by temperature")
-    axes[0].plot(hours, [100 * e.gain for e in tracked], lw=1.2, label="followed")
-    axes[0].set_ylabel("voltages since\nthe tare (%)")
-    axes[0].legend(frameon=False)
-    pressed = [each for each in tracked if each.truth > 0]
-    times = [each.time_s / 3600 for each in pressed]
-    axes[1].plot(times, [e.truth for e in pressed], "_", color="0.6", mew=4, label="true")
-    axes[1].plot(times, [e.magnitude for e in pressed], ".", ms=3, label="tracked")
-    late = [each for each in untracked if each.truth > 0]
-    bare = [e.magnitude for e in late]
-    axes[1].plot([e.time_s / 3600 for e in late], bare, "x", ms=4, label="untracked")
-    axes[1].set_ylabel("|Δσ|/σ₀ of\nfirm presses")
-    axes[1].legend(frameon=False, ncols=3)
-    for each in day.presses:
-        for axis in axes:
-            axis.axvspan(each.start_s / 3600, each.end_s / 3600, color="0.93", lw=0)
-    for label, frames in seen.items():
-        ghosts = [each.ghosts for each in frames]
-        axes[2].plot([e.time_s / 3600 for e in frames], ghosts, label=label)
-    axes[2].set_ylabel("contacts where\nnothing presses")
-    axes[2].set_xlabel("hours since the tare; grey: something presses (simulated)")
-    axes[2].set_xlim(hours[0], hours[-1])
-    axes[2].legend(loc="center right")  # framed: nothing says where ghosts leave room
-    save_figure(figure, output)
 
 
 def _size_mm(sensor: SensorDescription) -> str:

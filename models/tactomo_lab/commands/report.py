@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_type_hin
 
 import typer
 from tactomo.cli.output import print_json, say, table
-from tactomo.cli.plot.plot import picture_option
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
@@ -23,7 +22,6 @@ Seeds = Annotated[
     Literal["tuning", "reporting"],
     typer.Option(help="Tune on the one set of scenes, publish figures of the other."),
 ]
-Picture = Annotated[Path | None, picture_option("Draw truth and outcome")]
 
 
 def _figures(kind: type) -> dict[str, tuple[str, Figure]]:

@@ -1,6 +1,7 @@
 """The scenes that a pressure field has to explain, in rows: soft, graded, mixed, crowded, moving.
 
-Still scenes, each reconstructed from a cold start and run to its end, and moving ones. The rows of
+Still scenes, each reconstructed from a cold start and run to its end, moving ones, and days of a
+skin that drifts. The rows of
 ordinary scenes, rectangles and rings are `still_scenes`'; each of the others is the regime of that
 name, of which the last frame counts. What counts is what a user is told: a bad map with no flag of
 `DISTRUST` is a silent failure, a good one with such a flag a false alarm.
@@ -16,6 +17,7 @@ from typing import Final
 
 from tactomo_models.sensor.description import SensorDescription
 
+from tactomo_lab.evaluation.drifting import draw_day
 from tactomo_lab.evaluation.moving import (
     COMING,
     NOISE_DB,
@@ -28,7 +30,6 @@ from tactomo_lab.evaluation.play import Outcome, play
 from tactomo_lab.evaluation.regimes import REGIMES, make_case
 from tactomo_lab.scenes.case import Case, with_companion
 from tactomo_lab.scenes.drawing import SeedSet
-from tactomo_lab.scenes.measures import Score
 from tactomo_lab.scenes.still_scenes import SCENE_SHAPES, SceneShape, draw_still, still_case
 
 MAX_CONTACTS = 4  # of a scene that is not crowded
@@ -49,18 +50,19 @@ REGIME_ROWS: Final = (
 STILL_ROWS: Final = ("ordinary", "rectangles-rings", *REGIME_ROWS)
 MOVING_ROWS: Final = ("moving", "mixed-moving", "palm")
 ROWS: Final = (*STILL_ROWS, *MOVING_ROWS)
+DAYS: Final = "day"  # takes minutes: only where it is asked for
 SCENES_A_SEQUENCE = 10  # a moving scene has some 100 frames and takes a minute to simulate
 
 
-def scores_of_row(
+def frames_of_row(
     description: SensorDescription,
     row: str,
     method: str,
     seed_set: SeedSet,
     count: int,
     companion: float | None = None,
-) -> dict[str, Iterator[Score]]:
-    """Frames of one of `ROWS`, or of a regime, as a method has them, by the name of their line.
+) -> dict[str, Iterator[Outcome]]:
+    """Frames of one of `ROWS`, of days or of a regime as a method has them, by their line's name.
 
     Without those whose scan is lost, for a map of half a measurement is another question, and those
     in which a palm is still to come; of a regime's case the last frame. `count` is as
@@ -79,13 +81,12 @@ def scores_of_row(
         return frame.scans.keys() >= set(case.description.channels) and frame.phase != COMING
 
     return {
-        line: (
-            outcome.score
-            for outcome in play(
+        line: filter(
+            counts,
+            play(
                 cases if companion is None else (with_companion(case, companion) for case in cases),
                 method,
-            )
-            if counts(outcome)
+            ),
         )
         for line, cases in cases_of_row(description, row, seed_set, count).items()
     }
@@ -94,10 +95,10 @@ def scores_of_row(
 def cases_of_row(
     description: SensorDescription, row: str, seed_set: SeedSet, count: int
 ) -> dict[str, Iterator[Case]]:
-    """Cases of one of `ROWS` or `REGIMES`, by the name of their line; the same ones every time.
+    """Cases of one of `ROWS`, `DAYS` or `REGIMES`, by their line's name; the same ones every time.
 
-    `count` is of the scenes of each line, palms too; of other moving ones there is one for
-    `SCENES_A_SEQUENCE`.
+    `count` is of the scenes of each line, palms too; of other moving ones and of days there is one
+    for `SCENES_A_SEQUENCE`.
 
     Raises DataError where the row cannot happen to the sensor, or has no room on it.
     """
@@ -115,6 +116,14 @@ def cases_of_row(
         return {row: still(("rectangle", "ring"), SHAPES_DB)}
     if row == "palm":
         return {row: (palm_sequence(description, seed_set, number) for number in range(count))}
+    if row == DAYS:
+        return {
+            f"{row}, {what}": (
+                draw_day(description, seed_set, number, is_followed=is_followed)
+                for number in numbers
+            )
+            for what, is_followed in (("reference follows", True), ("one tare", False))
+        }
     if row == "moving":
         return {row: (draw_sequence(description, seed_set, number) for number in numbers)}
     if row == "mixed-moving":
@@ -134,13 +143,3 @@ def _still(
             plan = draw_still(description, seed_set, contacts, number)
             if plan.shape in shapes:
                 yield still_case(description, plan, seed_set, number, snr_db)
-
-
-def middle_press(
-    description: SensorDescription, method: str, seed_set: SeedSet, count: int
-) -> Outcome:
-    """One soft contact as a method has it: the scene whose ICC is the middle."""
-    soft = cases_of_row(description, "soft", seed_set, count)["soft"]
-    single = (case for case in soft if len(case.plan.frames[-1]) == 1)
-    outcomes = sorted(play(single, method), key=lambda outcome: outcome.score.icc)
-    return outcomes[len(outcomes) // 2]

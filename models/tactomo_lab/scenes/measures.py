@@ -8,7 +8,7 @@ change at `FULL_RANGE_KPA`, as the paper's are, which normalises by it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Annotated, Any, NamedTuple
 
@@ -36,7 +36,6 @@ SURE_SIGMAS = 3.0  # standard uncertainties that an error exceeds in one of 370 
 TWO_SIDED_95 = 1.96  # standard uncertainties that 95 % of a normal distribution lie within
 FULL_RANGE_KPA = PRESSURE_KPA[1]
 NOT_WHOLE = DISTRUST | Flag.STRUCTURE_MISSING | Flag.MAGNITUDE_MISSING  # flags that tell a user
-BAND_KPA = 10.0  # pressures that count as one where errors at one pressure are compared
 
 
 def correlation(image: NDArray[Any] | None, truth: FloatArray) -> float:
@@ -79,12 +78,9 @@ class ContactScore:
     magnitude: float  #: true |relative conductivity change|
     #: distance of the centroids; NaN if missed, as everything below
     centre_error_mm: float = float("nan")
-    area_error: float = float("nan")  #: relative error of the area
     magnitude_error: float = float("nan")  #: found minus true, as a share of the range
     #: its standard uncertainty as reported, as a share of the range
     magnitude_sigma: float = float("nan")
-    #: found minus true; NaN, too, where no pressure was reported
-    pressure_error_kpa: float = float("nan")
     #: relative error of the peak pressure, or of the pressure where no peak was reported; NaN, too,
     #: where neither was
     peak_error: float = float("nan")
@@ -314,10 +310,8 @@ def score_contact(
     return replace(
         known,
         centre_error_mm=1e3 * float(np.hypot(found.x_m - true.x_m, found.y_m - true.y_m)),
-        area_error=found.area_m2 / true.area_m2 - 1,
         magnitude_error=(found.magnitude - true.magnitude) / full,
         magnitude_sigma=found.magnitude_sigma / full,
-        pressure_error_kpa=found.pressure_kpa - true.pressure_kpa,
         peak_error=_peak_kpa(found) / true.pressure_kpa - 1,
         x_error_sigmas=_sigmas(found.x_m - true.x_m, found.x_sigma_m),
         y_error_sigmas=_sigmas(found.y_m - true.y_m, found.y_sigma_m),
@@ -369,15 +363,9 @@ class Summary:
     false: Annotated[float, Figure("false", ".2f", "a scene")]
     centre_mm: Annotated[float, Figure("mm", ".2f", "centre error, median")]
     centre_mm_95: Annotated[float, Figure("p95", ".1f")]  #: 95th percentile, matched contacts
-    area_error: Annotated[float, Figure("area", ".0%")]  #: median of the relative error's size
     magnitude_error: Annotated[
         float, Figure("Δσ", ".1%", "error of the magnitude, mean, share of the range")
     ]
-    #: in bands of `BAND_KPA`: the paper's measure
-    magnitude_spread: Annotated[
-        float, Figure("spread", ".0%", "largest minus smallest at one pressure")
-    ]
-    pressure_error_kpa: Annotated[float, Figure("kPa", ".1f")]  #: its size, where one was reported
     within_sigma: Annotated[
         float,
         Figure("in σ", ".0%", "within one reported standard uncertainty, 68 % where that is right"),
@@ -446,10 +434,7 @@ def summarise(scores: Sequence[Score]) -> Summary:
         false=mean(one.found - sum(not c.missed for c in one.contacts) for one in scores),
         centre_mm=percentile(centre, 50),
         centre_mm_95=percentile(centre, 95),
-        area_error=percentile([abs(contact.area_error) for contact in matched], 50),
         magnitude_error=mean(np.abs(error)),
-        magnitude_spread=_largest_spread(matched),
-        pressure_error_kpa=mean(abs(contact.pressure_error_kpa) for contact in matched),
         within_sigma=mean(np.where(np.isfinite(error), np.abs(error) <= sigma, np.nan)),
         place_within_sigma=_share_within_one(place),
         area_within_sigma=_share_within_one([contact.area_error_sigmas for contact in matched]),
@@ -490,47 +475,3 @@ def percentile(values: Iterable[Any], percent: float) -> float:
 def _known(values: Iterable[Any]) -> FloatArray:
     array = np.array(list(values), dtype=np.float64)
     return array[np.isfinite(array)]
-
-
-def _largest_spread(contacts: Iterable[ContactScore]) -> float:
-    bands: dict[int, list[float]] = {}
-    for contact in contacts:
-        if np.isfinite(contact.magnitude_error):
-            band = int(contact.pressure_kpa // BAND_KPA)
-            bands.setdefault(band, []).append(contact.magnitude_error)
-    return max((max(errors) - min(errors) for errors in bands.values()), default=float("nan"))
-
-
-def _contrast_band(one: Score) -> str:
-    edges = (10, 22, 46, 100)  # equal parts of the logarithm
-    index = int(np.searchsorted(edges[1:-1], one.contrast, side="right"))
-    return f"{edges[index]}-{edges[index + 1]}"
-
-
-GROUPINGS: dict[str, Callable[[Score], str]] = {
-    "contacts": lambda one: str(len(one.contacts)),
-    "SNR (dB)": lambda one: f"{one.snr_db:g}",
-    "shape": lambda one: one.shape,
-    "contrast": _contrast_band,
-    "sign": lambda one: "opposite" if one.opposite else "as shipped",
-}
-
-
-def summaries(scores: Sequence[Score]) -> dict[str, dict[str, Summary]]:
-    """Measures by every grouping: what it goes by, its value, and that value's scenes."""
-    return {
-        name: {
-            value: summarise([one for one in scores if key(one) == value])
-            for value in sorted({key(one) for one in scores}, key=_natural)
-        }
-        for name, key in GROUPINGS.items()
-    }
-
-
-def _natural(value: str) -> tuple[float, str]:
-    """Numbers by size, words by the alphabet."""
-    head = value.split("-")[0]
-    try:
-        return float(head), value
-    except ValueError:
-        return float("inf"), value

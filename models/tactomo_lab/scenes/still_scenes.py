@@ -7,14 +7,13 @@ sheets.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from typing import Literal
 
 import numpy as np
 from tactomo_models.scene.press import Press
 from tactomo_models.sensor.description import SensorDescription
 
-from tactomo_lab.scenes.case import Case, Plan, SnrOf, measure, simulate, with_noise
+from tactomo_lab.scenes.case import Case, Plan, measure, simulate, with_noise
 from tactomo_lab.scenes.drawing import (
     GAP_M,
     SHAPES,
@@ -28,30 +27,8 @@ from tactomo_lab.scenes.drawing import (
 
 SceneShape = Literal["ellipse", "rectangle", "ring", "mixed"]
 
-CONTACTS = (1, 2, 3, 4, 5, 6)
 SCENE_SHAPES: tuple[SceneShape, ...] = ("ellipse", "rectangle", "ring", "mixed")
 TRIES = 30  # of a contact, before all are drawn anew
-
-
-def scenes(
-    description: SensorDescription,  # the sensor
-    # "tuning" for whoever chooses a constant by what comes out, "reporting" for figures that are
-    # published
-    seed_set: SeedSet,
-    count: int,  # scenes of each number of contacts
-    *,
-    contacts: Iterable[int] = CONTACTS,  # how many contacts
-    snr_db: float = 40.0,  # signal-to-noise ratio in decibels
-    snr_of: SnrOf = "change",  # what the noise is measured by; see `noise_std`
-) -> Iterator[Case]:
-    """Scenes of a seed set, `count` of each number of contacts; the same ones every time.
-
-    Raises DataError where the sensor has no room for that many contacts.
-    """
-    for contact_count in contacts:
-        for number in range(count):
-            plan = draw_still(description, seed_set, contact_count, number)
-            yield still_case(description, plan, seed_set, number, snr_db, snr_of)
 
 
 def still_case(
@@ -60,13 +37,12 @@ def still_case(
     seed_set: SeedSet,
     number: int,
     snr_db: float,
-    snr_of: SnrOf = "change",
 ) -> Case:
-    """Simulate a plan of one frame and measure it with this noise."""
+    """Simulate a plan of one frame and measure it with noise of this ratio of the change."""
     numbers = len(plan.frames[-1]), number
     simulated = simulate(description, plan, seed_of(seed_set, "sheet", *numbers))
     noise = seed_of(seed_set, "noise", *numbers)
-    simulated = with_noise(simulated, snr_db, snr_of)
+    simulated = with_noise(simulated, snr_db, "change")
     return measure(simulated, seed_set, number, noise, is_tare_drawn_first=False)
 
 

@@ -34,6 +34,18 @@ def test_in_numbers_and_words(tactomo: Run, tmp_path: Path) -> None:
     assert "area in σ" in words.stdout
 
 
+@pytest.mark.parametrize(
+    ("picture", "told"),
+    [("field.txt", "not a kind of picture"), ("nowhere/field.png", "there is no folder nowhere")],
+)
+def test_a_picture_that_cannot_be_is_told_before_the_work(
+    tactomo: Run, picture: str, told: str
+) -> None:
+    result = tactomo("evaluate", "field", "--count", 1, "--picture", picture)
+    assert result.returncode == 1
+    assert told in result.stderr
+
+
 def test_an_unknown_row_is_a_usage_error(tactomo: Run) -> None:
     result = tactomo("evaluate", "field", "--rows", "soft,loud")
     assert result.returncode == 2

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tactomo_lab.scenes.case import Case, SnrOf
+from tactomo_lab.scenes.case import Case, SnrOf, measure, simulate, with_noise
 from tactomo_lab.scenes.drawing import (
     BOTH_CHANNELS,
     GAP_M,
@@ -17,6 +17,7 @@ from tactomo_lab.scenes.drawing import (
     SHAPES,
     gap_m,
     outline_of,
+    seed_of,
 )
 from tactomo_lab.scenes.simulation import (
     UnevenSkin,
@@ -25,7 +26,7 @@ from tactomo_lab.scenes.simulation import (
     with_contrast,
     with_opposite_magnitude,
 )
-from tactomo_lab.scenes.still_scenes import draw_still, scenes
+from tactomo_lab.scenes.still_scenes import draw_still
 from tactomo_models import DataError, Press, SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.bare_sheet import transfer_resistances
@@ -180,8 +181,10 @@ def test_every_sheet_is_uneven_in_its_own_way(paper: SensorDescription, mesh: Sh
 
 
 def one(paper: SensorDescription, snr_db: float = 40, snr_of: SnrOf = "change") -> Case:
-    (scene,) = scenes(paper, "tuning", 1, contacts=(2,), snr_db=snr_db, snr_of=snr_of)
-    return scene
+    plan = draw_still(paper, "tuning", 2, 0)
+    simulated = simulate(paper, plan, seed_of("tuning", "sheet", 2, 0))
+    noise = seed_of("tuning", "noise", 2, 0)
+    return measure(with_noise(simulated, snr_db, snr_of), "tuning", 0, noise)
 
 
 def scan_of(case: Case) -> FloatArray:

@@ -6,13 +6,11 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from tactomo_lab.evaluation.field import MOVING_ROWS, STILL_ROWS, scores_of_row
+from tactomo_lab.evaluation.field import MOVING_ROWS, STILL_ROWS, frames_of_row
 from tactomo_lab.evaluation.moving import draw_sequence, mixed_sequence
-from tactomo_lab.evaluation.play import play
 from tactomo_lab.evaluation.regimes import REGIMES, can_happen, draw_plan, make_case
 from tactomo_lab.scenes.case import Plan
 from tactomo_lab.scenes.drawing import outline_of
-from tactomo_lab.scenes.still_scenes import scenes
 from tactomo_models import DataError, SensorDescription, load_description
 from tactomo_protocol import Channel
 from variants import variant
@@ -30,8 +28,9 @@ def alone(small: SensorDescription, channel: Channel) -> SensorDescription:
 @pytest.mark.parametrize("channel", Channel)
 def test_a_sheet_is_scored_by_what_it_shows(small: SensorDescription, channel: Channel) -> None:
     """Without a magnitude channel the pressed shape is the map; without the other there is none."""
-    drawn = scenes(alone(small, channel), "tuning", 1, contacts=[1])
-    (outcome,) = play(drawn, "tikhonov")
+    outcome, *_ = frames_of_row(alone(small, channel), "ordinary", "tikhonov", "tuning", 1)[
+        "ordinary 40 dB"
+    ]
     assert set(outcome.frame.scans) == {channel}
     assert outcome.score.icc > 0.6
     assert (outcome.score.icc_structure > 0.6) is (channel is Channel.STRUCTURE)
@@ -68,8 +67,8 @@ def test_every_row_of_one_sheet(small: SensorDescription, channel: Channel) -> N
     sensor = alone(small, channel)
     for row in (*STILL_ROWS, *MOVING_ROWS):
         if can_happen(row, sensor):
-            for scores in scores_of_row(sensor, row, "tikhonov", "tuning", 1).values():
-                assert np.isfinite([score.rie for score in islice(scores, 12, 13)]).all()
+            for frames in frames_of_row(sensor, row, "tikhonov", "tuning", 1).values():
+                assert np.isfinite([each.score.rie for each in islice(frames, 12, 13)]).all()
 
 
 @pytest.mark.parametrize("name", OUTLINES)

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 from made_score import made_score
-from tactomo_lab.evaluation.field import scores_of_row
+from tactomo_lab.evaluation.field import frames_of_row
 from tactomo_lab.evaluation.play import Played, Player, Variant, play
 from tactomo_lab.evaluation.regimes import KINDS, REGIMES, draw_plan, make_case
 from tactomo_lab.scenes.case import Case, Plan
@@ -272,15 +272,15 @@ def test_a_case_is_judged_by_its_last_frame(
     small: SensorDescription, small_artifact: Artifact
 ) -> None:
     case = case_of(small, "jump")
-    (score,) = scores_of_row(small, "jump", "tikhonov", "tuning", 1)["jump"]
+    (outcome,) = frames_of_row(small, "jump", "tikhonov", "tuning", 1)["jump"]
     alone = Reconstructor(case.description, small_artifact, method="tikhonov")
     alone.set_reference(case.tare)
     scans = case.frames[-1].scans
     frame = alone.reconstruct(scans[Channel.MAGNITUDE], scans[Channel.STRUCTURE])
     assert frame.map is not None
     expected = np.corrcoef(frame.map.ravel(), case.truth.map.ravel())[0, 1]
-    assert score.icc == pytest.approx(expected)
-    assert score.groups == len(case.plan.frames[-1])
+    assert outcome.score.icc == pytest.approx(expected)
+    assert outcome.score.groups == len(case.plan.frames[-1])
 
 
 @pytest.mark.slow

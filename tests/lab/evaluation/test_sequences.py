@@ -7,7 +7,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
-from tactomo_lab.evaluation.field import scores_of_row
+from tactomo_lab.evaluation.field import frames_of_row
 from tactomo_lab.evaluation.moving import (
     COMING,
     Step,
@@ -126,10 +126,10 @@ def test_a_palm_is_followed_while_the_reference_is(small: SensorDescription) -> 
         for phase in (COMING, "palm")
     )
     assert max(light, default=0) < 2 <= min(palm)
-    (scores,) = scores_of_row(small, "palm", "tikhonov", "tuning", 1).values()
-    counted = list(scores)
+    (outcomes,) = frames_of_row(small, "palm", "tikhonov", "tuning", 1).values()
+    counted = [outcome.score.count_right for outcome in outcomes]
     assert len(counted) == len(palm)
-    assert {score.count_right for score in counted} <= {True, False}
+    assert set(counted) <= {True, False}
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from tactomo_lab.evaluation.trade_off import (
     variants,
 )
 from tactomo_lab.scenes.measures import summarise
-from tactomo_lab.scenes.still_scenes import scenes
+from tactomo_lab.scenes.still_scenes import draw_still, still_case
 from tactomo_models import Artifact, SensorDescription, available_methods
 from tactomo_models.methods.registry import BUDGETED
 
@@ -74,7 +74,7 @@ def test_still_scenes_are_measured_under_each_budget(
     paper: SensorDescription, artifact: Artifact, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tactomo_lab.evaluation.play.load_or_build_artifact", lambda _: artifact)
-    drawn = list(scenes(paper, "tuning", 1, contacts=(3,), snr_db=20))
+    drawn = [still_case(paper, draw_still(paper, "tuning", 3, 0), "tuning", 0, 20.0)]
     asked = [Variant("tikhonov"), Variant("fit", 0.001), Variant("fit", 0.2)]
     done: list[None] = []
     linear, hasty, patient = measure(drawn, asked, lambda: done.append(None))

@@ -15,7 +15,7 @@ FILE = "my_sheet.toml"
 SMALLER = {
     "--scenes 2000": "--scenes 60 --jobs 1",
     "--epochs 20": "--epochs 1 --batch 16",
-    "--count 5 --contacts 1-4": "--count 1 --contacts 1",
+    "--count 20": "--count 1",
 }
 
 
