@@ -31,34 +31,26 @@ def test_in_numbers(tactomo: Run, few: tuple[object, ...]) -> None:
     cells = told["figures"]["5"]
     assert len(cells) == 4 * 4 * 2
     assert {cell["snr_db"] for cell in cells} == {None, 40, 20, 10}
-    assert len(told["figures"]["9"]["estimates"]) == 16 * 2
+    (error, _) = told["figures"]["9"]["errors"]
+    assert [len(of_case) for of_case in error["estimates"]] == [4, 4, 4, 4]
     assert told["figures"]["9"]["paper_hardware"]["cnn-multimodal"]["error"] == 0.21
-
-
-@pytest.mark.long
-def test_every_figure(tactomo: Run, few: tuple[object, ...]) -> None:
-    result = tactomo(*few, "--method", "tikhonov", "--json")
-    assert result.returncode == 0
-    figures = json.loads(result.stdout)["figures"]
-    assert set(figures) == {"5", "9", "10", "11", "12"}
-    assert len(figures["10"]["places"]) == 25
 
 
 @pytest.mark.slow
 def test_in_words(tactomo: Run, few: tuple[object, ...]) -> None:
-    result = tactomo(*few, "--figure", "9,12", "--method", "tikhonov")
+    result = tactomo(*few, "--figure", "10", "--method", "tikhonov")
     assert result.returncode == 0
     assert "Ours are simulated, not measured: small, tuning seeds" in result.stdout
-    for words in ("76% (at 200 kPa)", "paper, hardware", "ours, simulated", "10*"):
+    for words in ("7.7 ± 6.6", "paper, hardware", "ours, simulated"):
         assert words in result.stdout
-    assert "Fig. 10" not in result.stdout
+    assert "Fig. 5" not in result.stdout
 
 
 @pytest.mark.slow
 def test_a_method_that_cannot_be_had_is_said_and_left_out(
     tactomo: Run, few: tuple[object, ...]
 ) -> None:
-    asked = (*few, "--figure", "8", "--method")
+    asked = (*few, "--figure", "9", "--method")
     result = tactomo(*asked, "network", "--method", "tikhonov")
     assert result.returncode == 0
     assert "left out: network" in result.stderr

@@ -2,91 +2,62 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from tactomo_lab.evaluation import paper as figures
 from tactomo_lab.evaluation.paper import (
     CASE_KPA,
-    LOCALISATION,
-    MORE,
-    SINGLE,
-    TWO,
-    Arrangement,
-    Frame,
-    Rig,
     cells,
-    image_cases,
     image_mass,
+    image_of,
     locate,
     magnitude_errors,
     magnitude_estimate,
     paper_scenes,
-    presses_of,
-    read_areas,
+    places,
+    pressed_in_turn,
+    single_areas,
 )
-from tactomo_lab.evaluation.play import play
-from tactomo_lab.scenes.drawing import BOTH_CHANNELS, gap_m, outline_of
-from tactomo_lab.scenes.simulation import truth_of
-from tactomo_models import Artifact, Reconstruction, SensorDescription, build_artifact
-from tactomo_models.arrays import FloatArray
+from tactomo_lab.evaluation.play import Outcome, play
+from tactomo_lab.scenes.case import Case
+from tactomo_lab.scenes.drawing import BOTH_CHANNELS, outline_of
+from tactomo_models import Artifact, SensorDescription, build_artifact
 from tactomo_models.scene.contacts import Contact
-from tactomo_protocol import Channel
 
-SHORT = [replace(case, pressures_kpa=((200.0,),)) for case in SINGLE[:2]]
+
+@pytest.fixture(autouse=True, scope="module")
+def _built(small: SensorDescription) -> Iterator[None]:
+    artifact: Artifact = build_artifact(small)
+    with pytest.MonkeyPatch.context() as patch:
+        name = "tactomo_lab.evaluation.play.load_or_build_artifact"
+        patch.setattr(name, lambda _: artifact)
+        yield
 
 
 @pytest.fixture(scope="module")
-def rig(small: SensorDescription) -> Rig:
-    return Rig(small, "tuning", 0)
+def outcome(small: SensorDescription) -> Outcome:
+    """One press in the middle, as `fit` has it."""
+    (case,) = pressed_in_turn(small, "tuning", 0, single_areas(small)[:1])
+    (made,) = play([case], "fit")
+    return made
 
 
-@pytest.fixture(scope="module")
-def small_artifact(small: SensorDescription) -> Artifact:
-    return build_artifact(small)
-
-
-@pytest.fixture(autouse=True)
-def _built(small_artifact: Artifact, monkeypatch: pytest.MonkeyPatch) -> None:
-    name = "tactomo_lab.evaluation.play.load_or_build_artifact"
-    monkeypatch.setattr(name, lambda _: small_artifact)
-
-
-def frame(
-    description: SensorDescription,
-    case: Arrangement,
-    pressures_kpa: tuple[float, ...],
-    image: FloatArray | None,
-    method: str = "network",
-    contacts: tuple[Contact, ...] = (),
-) -> Frame:
-    shown = None if image is None else image.astype(np.float32)
-    made = Reconstruction(shown, None, None, contacts, "noser", "by hand", 1.0)
-    truth = truth_of(description, presses_of(description, case, pressures_kpa))
-    return Frame(case, pressures_kpa, 0, method, made, truth)
-
-
-# ------------------------------------------------------------------ what is pressed
-
-
-def test_cases_fit_on_the_sheet_and_lie_apart(paper: SensorDescription) -> None:
-    assert [case.number for case in (*SINGLE, *TWO, *MORE)] == list(range(1, 11))
-    assert len(LOCALISATION) == 25
-    assert [len(case.pressures_kpa) for case in (*SINGLE, *TWO)] == [4, 4, 4, 4, 4, 4]
-    for case in (*SINGLE, *TWO, *MORE, *LOCALISATION):
-        for pressures_kpa in case.pressures_kpa:
-            presses = presses_of(paper, case, pressures_kpa)
-            for number, press in enumerate(presses):
-                x, y = outline_of(press)
-                assert paper.on_sheet(x, y, paper.sheet.frame_width_m).all()
-                assert all(gap_m(press, other) > 0.005 for other in presses[:number])
-    places = {(case.areas[0].x_mm, case.areas[0].y_mm) for case in LOCALISATION}
-    assert places == {(18.0 * i, 18.0 * j) for i in range(-2, 3) for j in range(-2, 3)}
+def test_cases_fit_on_the_sheet(paper: SensorDescription) -> None:
+    assert len(single_areas(paper)) == 16
+    for press in (*single_areas(paper), *places(paper)):
+        x, y = outline_of(press)
+        assert paper.on_sheet(x, y, paper.sheet.frame_width_m).all()
+    there = {(round(press.x_m, 6), round(press.y_m, 6)) for press in places(paper)}
+    along_m = (-0.036, -0.018, 0.0, 0.018, 0.036)
+    assert there == {(x, y) for x in along_m for y in along_m}
 
 
 @pytest.mark.slow
 def test_scenes_of_the_simulation_study(small: SensorDescription) -> None:
-    drawn = list(paper_scenes(small, "tuning", 1, snr_db=np.inf))
+    drawn = list(paper_scenes(small, "tuning", 1, np.inf))
     assert [len(scene.plan.frames[0]) for scene in drawn] == [1, 2, 3, 4]
     for scene in drawn:
         assert {press.shape for press in scene.plan.frames[0]} == {"ellipse"}
@@ -97,52 +68,40 @@ def test_scenes_of_the_simulation_study(small: SensorDescription) -> None:
         np.testing.assert_array_equal(scene.tare.magnitude, drawn[0].tare.magnitude)
         assert scene.description.magnitude is not None
         assert scene.description.magnitude.response.sign == -1
-    other = next(paper_scenes(small, "reporting", 1))
-    assert other.plan.frames != drawn[0].plan.frames
+    points = cells(play(drawn[:2], "tikhonov", "noser"))
+    ways = [(p.method, p.contacts) for p in points]
+    assert ways == [("tikhonov", 1), ("noser", 1), ("tikhonov", 2), ("noser", 2)]
+    assert all(point.summary.icc > 0.3 for point in points)
 
 
-@pytest.mark.slow
-def test_points_of_the_simulation_study(small: SensorDescription) -> None:
-    drawn = list(paper_scenes(small, "tuning", 1, contacts=(1, 2)))
-    points = cells(play(drawn, "tikhonov", "noser"))
-    assert [(p.method, p.contacts) for p in points] == [
-        ("tikhonov", 1),
-        ("noser", 1),
-        ("tikhonov", 2),
-        ("noser", 2),
-    ]
-    for point in points:
-        (outcome,) = play([drawn[point.contacts - 1]], point.method)
-        assert point.summary.icc == outcome.score.icc > 0.3
+def test_a_rig_measures_one_uneven_sensor(
+    small: SensorDescription, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def pressed(sheet: int) -> Case:
+        return next(pressed_in_turn(small, "tuning", sheet, single_areas(small)))
 
-
-def test_a_rig_measures_one_uneven_sensor(small: SensorDescription, rig: Rig) -> None:
-    presses = presses_of(small, SINGLE[0], (200.0,))
-    quiet = Rig(small, "tuning", 0, snr_db=np.inf)
-    other = Rig(small, "tuning", 1, snr_db=np.inf)
-    case, again, silent = (each.press(presses) for each in (rig, Rig(small, "tuning", 0), quiet))
-    (scan,), (same,), (clean,) = ([f.scans for f in one.frames] for one in (case, again, silent))
+    case, again = pressed(0), pressed(0)
+    monkeypatch.setattr(figures, "PRESSED_SNR_DB", np.inf)
+    silent, other = pressed(0), pressed(1)
     for name in BOTH_CHANNELS:
-        np.testing.assert_array_equal(scan[name], same[name])
-        rest = getattr(quiet.tare, name)
-        noise = scan[name] - clean[name]
-        assert np.std(noise) == pytest.approx(1e-3 * np.sqrt(np.mean(rest**2)), rel=0.4)
+        scan, same, clean = (one.frames[0].scans[name] for one in (case, again, silent))
+        np.testing.assert_array_equal(scan, same)
+        rest = getattr(silent.tare, name)
+        assert np.std(scan - clean) == pytest.approx(1e-3 * np.sqrt(np.mean(rest**2)), rel=0.4)
         assert 0.003 < np.std(getattr(other.tare, name) / rest) < 0.3
-    bare = rig.press(()).frames[0].scans
-    assert not np.array_equal(scan[Channel.MAGNITUDE], bare[Channel.MAGNITUDE])
+        assert np.abs(clean - rest).max() > 1e-3 * np.abs(rest).max()
 
 
-# ------------------------------------------------------------------ how it is measured
-
-
-def test_frames_come_from_a_cold_start(small: SensorDescription, rig: Rig) -> None:
-    frames = list(image_cases([rig], SHORT, ["fit"]))
-    alone = list(image_cases([rig], SHORT[1:], ["fit"]))
-    np.testing.assert_array_equal(alone[-1].image, frames[-1].image)
-    place = locate(frames[-1], small)
+def test_a_press_is_located(outcome: Outcome) -> None:
+    place = locate(outcome)
     assert place.contacts == 1
     assert place.contact_error_mm < 1
     assert place.mass_error_mm < 1
+    nothing = replace(outcome, made=replace(outcome.made, map=None, contacts=()))
+    assert not image_of(nothing).any()
+    place = locate(nothing)
+    assert np.isnan([place.mass_error_mm, place.contact_error_mm]).all()
+    assert place.contacts == 0
 
 
 def test_one_number_for_an_image() -> None:
@@ -153,25 +112,23 @@ def test_one_number_for_an_image() -> None:
 
 
 def test_the_magnitude_error_is_the_largest_spread_at_one_pressure(
-    small: SensorDescription,
+    small: SensorDescription, outcome: Outcome
 ) -> None:
     """Over the largest estimate of all, as the paper normalises, and over the range of 0.25."""
     estimates = np.array(
         [[0.02, 0.04, 0.06, 0.08], [0.05, 0.10, 0.16, 0.20], [0.02, 0.03, 0.06, 0.09]]
     )
-    estimates = np.vstack([estimates, [0.05, 0.15, 0.12, 0.10]])  # the last one falls again
     contact = Contact(1, 0.0, 0.0, 1e-4, 0.1)
-    frames = [
-        frame(small, case, (kpa,), np.full((21, 21), value), contacts=(contact,))
-        for case, row in zip(SINGLE, estimates, strict=True)
-        for kpa, value in zip(CASE_KPA, row, strict=True)
+    made = [
+        replace(outcome.made, map=np.full((21, 21), value, np.float32), contacts=(contact,))
+        for value in estimates.ravel()
     ]
-    (error,) = magnitude_errors(frames, small)
+    (error,) = magnitude_errors([replace(outcome, made=each) for each in made], small)
     assert error.error == pytest.approx(0.12 / 0.20, rel=1e-5)
     assert error.of_range == pytest.approx(0.12 / 0.25, rel=1e-5)
     assert error.of_contacts == 0
-    assert error.rises == 0.75
-    assert error.pressure_kpa in (160.0, 200.0)  # the same at both
+    assert error.pressure_kpa == CASE_KPA[-1]
+    np.testing.assert_allclose(error.estimates, estimates, rtol=1e-5)
 
 
 def test_the_mass_of_an_image(small: SensorDescription) -> None:
@@ -181,28 +138,3 @@ def test_the_mass_of_an_image(small: SensorDescription) -> None:
     assert x_m == pytest.approx(small.map_x_m[5])
     assert y_m == pytest.approx(small.map_y_m[6])
     assert np.isnan(image_mass(np.zeros((21, 21)), small)).all()
-
-
-def test_what_was_not_found_has_no_place(small: SensorDescription) -> None:
-    place = locate(frame(small, LOCALISATION[0], (200.0,), None), small)
-    assert np.isnan([place.mass_error_mm, place.contact_error_mm]).all()
-    assert place.contacts == 0
-
-
-def test_areas_of_one_image(small: SensorDescription) -> None:
-    case, pressures_kpa = TWO[0], (200.0, 140.0)
-    truth = frame(small, case, pressures_kpa, None).truth.map
-    read = read_areas(frame(small, case, pressures_kpa, truth), small)
-    assert read.told_apart
-    assert read.ordered == (True,)
-    assert read.alike == ()
-    assert read.icc == pytest.approx(1)
-    assert not read.counted
-    merged = read_areas(frame(small, case, pressures_kpa, truth + truth.max()), small)
-    assert not merged.told_apart
-    nothing = read_areas(frame(small, case, (200.0, 200.0), None), small)
-    assert not nothing.told_apart
-    assert nothing.alike == (0.0,)
-    half = replace(nothing, estimates=(0.1, 0.2))
-    assert half.alike == (0.5,)
-    assert replace(read, estimates=(0.1, 0.2)).ordered == (False,)
