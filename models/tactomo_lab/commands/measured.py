@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict
+from fnmatch import filter as matching
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
@@ -15,29 +16,32 @@ from tactomo.errors import TactomoError
 from tactomo_lab.commands.report import shown, tell
 
 if TYPE_CHECKING:
+    from rich.table import Table
     from tactomo.cli.console import Console
     from tactomo_models import SensorDescription
 
 app = typer_app()
+File = Annotated[Path, typer.Argument(metavar="FILE.npz", help="A set of arrays (format below).")]
 
 
 class Measured(NamedTuple):
-    """What a set shows: its figure, tables with their captions, all for programs."""
+    """What a set shows: its figure, a table with its caption, all for programs."""
 
     ours: str
-    details: list[str]
+    table: Table
+    caption: str
     facts: dict[str, Any]
 
 
 class Kind(NamedTuple):
     """A kind of measured sets."""
 
-    arrays: tuple[str, ...]  # what sets of the kind are recognised by: the names of their arrays
+    arrays: tuple[str, ...]  # what sets of the kind are recognised by: patterns of arrays' names
     description: str  # the shipped sensor that public sets are of
     measure: Callable[[Path, str], Measured]  # what measures a set, of its path and its sensor
 
 
-def tank_of(sensor: str) -> SensorDescription:
+def _tank_of(sensor: str) -> SensorDescription:
     """Load the description of a round tank.
 
     Raises TactomoError where it is none.
@@ -53,69 +57,127 @@ def tank_of(sensor: str) -> SensorDescription:
     return description
 
 
-def saline_tanks(path: Path, sensor: str) -> Measured:
+def _saline_tanks(path: Path, sensor: str) -> Measured:
     """Correlate images of tanks with the truth, by three methods."""
+    import numpy as np
     from scipy.stats import spearmanr
 
     from tactomo_lab.evaluation.tanks import TankImager, evaluate_tanks, read_tanks
 
-    tank = tank_of(sensor)
+    tank = _tank_of(sensor)
     methods = ["network", "noser", "tikhonov"]
     tanks = read_tanks(path, tank)
     made = evaluate_tanks(TankImager(tank), tanks, methods)
     found = list(shown(made, len(methods) * len(tanks.names), "tanks"))
     of = {name: [one for one in found if one.method == name] for name in methods}
-    ours, noser, tikhonov = (_mean([one.correlation for one in of[name]]) for name in methods)
-    ranks = spearmanr(
-        [one.confidence for one in of["network"]], [one.correlation for one in of["network"]]
-    )
-    details = [
-        "Correlation with the truth:",
-        *_table(
-            ["tank", *methods, "confidence"],
-            [
-                [one[0].name, *(f"{o.correlation:.3f}" for o in one), f"{one[0].confidence:.2f}"]
-                for one in zip(*of.values(), strict=True)
-            ],
-        ),
-        f"The network's confidence ranks them by {ranks.statistic:.2f} (Spearman).",
-    ]
+    means = {name: float(np.mean([one.correlation for one in of[name]])) for name in methods}
+    network = of["network"]
+    ranks = spearmanr([one.confidence for one in network], [one.correlation for one in network])
+    rows = table("tank", *methods, "confidence")
+    for one in zip(*of.values(), strict=True):
+        correlations = (f"{each.correlation:.3f}" for each in one)
+        rows.add_row(one[0].name, *correlations, f"{one[0].confidence:.2f}")
     told = ("name", "method", "correlation", "misfit", "confidence", "seconds")
-    facts = {
-        "mean_correlation": {"network": ours, "noser": noser, "tikhonov": tikhonov},
-        "tanks": [{name: getattr(one, name) for name in told} for one in found],
-    }
-    return Measured(f"{ours:.3f} (NOSER {noser:.2f}, Tikhonov {tikhonov:.2f})", details, facts)
-
-
-def round_skin(path: Path, sensor: str) -> Measured:
-    """Locate a robot's presses by several methods, cross-validated."""
-    from tactomo_models import load_description
-
-    from tactomo_lab.evaluation.skin_presses import METHODS, localise, read_presses
-
-    skin = load_description(sensor)
-    presses = read_presses(path, skin)
-    found = list(shown(localise(presses, skin), len(METHODS), "methods"))
-    physics = min(one.median_mm for one in found if "image" in one.method)
-    taught = min(one.median_mm for one in found if "taught" in one.method)
-    rows = [[one.method, f"{one.median_mm:.1f}", f"{one.most_mm:.1f}"] for one in found]
     return Measured(
-        f"{taught:.1f} mm (median) taught by the other presses; {physics:.1f} mm by physics alone",
-        ["Ten folds:", *_table(["error, mm", "median", "95 %"], rows)],
+        "mean correlation with the truth: "
+        + ", ".join(f"{name} {mean:.3f}" for name, mean in means.items()),
+        rows,
+        f"The network's confidence ranks the tanks by {ranks.statistic:.2f} (Spearman).",
         {
-            "presses": len(presses.changes),
-            "methods": {
-                one.method: {"median_mm": one.median_mm, "most_mm": one.most_mm} for one in found
-            },
+            "mean_correlation": means,
+            "tanks": [{name: getattr(one, name) for name in told} for one in found],
         },
     )
 
 
+def _round_skin(path: Path, sensor: str) -> Measured:
+    """Locate a robot's presses by physics and by teaching, cross-validated."""
+    import numpy as np
+    from tactomo_models import load_description
+
+    from tactomo_lab.evaluation.skin_presses import localise, read_presses
+
+    skin = load_description(sensor)
+    presses = read_presses(path, skin)
+    found = {
+        name: {"median_mm": float(np.median(mm)), "most_mm": float(np.quantile(mm, 0.95))}
+        for name, mm in shown(localise(presses, skin), 2, "methods")
+    }
+    rows = table("error, mm", "median", "95 %")
+    for name, one in found.items():
+        rows.add_row(name, *(f"{mm:.1f}" for mm in one.values()))
+    count = len(presses.changes)
+    facts = {"presses": count, "methods": found}
+    return Measured(f"{count} presses located", rows, "Judged in ten folds.", facts)
+
+
+def _challenge(path: Path, sensor: str, level: int | None = None) -> Measured:
+    """Score the challenge's tanks, without the electrodes that a level has lost."""
+    from tactomo_lab.evaluation.ktc import evaluate_challenge, read_challenge
+
+    description = _tank_of(sensor)
+    given = read_challenge(path, description)
+    if level is not None:
+        given = given.at_level(level)
+    tanks = list(shown(evaluate_challenge(given, description), len(given.truth), "tanks"))
+    total = sum(tank.score for tank in tanks)
+    rows = table("tank", "level", "readings", "score", "misfit", "CPU s")
+    for number, tank in enumerate(tanks):
+        figures = f"{tank.score:.3f}", f"{tank.misfit:.2f}", f"{tank.seconds:.1f}"
+        rows.add_row(str(number), str(tank.level), str(tank.readings), *figures)
+    told = ("level", "readings", "score", "misfit", "seconds")
+    each = [{name: getattr(tank, name) for name in told} for tank in tanks]
+    return Measured(f"sum of scores {total:.3f}", rows, "", {"score": total, "tanks": each})
+
+
+def _taught_skins(path: Path, sensor: str, train: int = 200) -> Measured:
+    """Learn each skin from its first presses and judge the last; any skin, whatever the sensor."""
+    import numpy as np
+
+    from tactomo_lab.evaluation.taught_presses import judge, read_skins
+
+    known = read_skins(path)
+    found = list(shown(judge(known, train), len(known), "skins"))
+    rows = table("error, mm", "judged", "median", "95 %", "in σ", "taught", "since then")
+    for one in found:
+        errors = (f"{one.median_mm:.2f}", f"{one.p95_mm:.1f}")
+        shares = (f"{one.within_sigma:.0%}", f"{one.is_taught:.0%}")
+        since = " ".join(f"{median:.1f}" for median in one.median_mm_since)
+        rows.add_row(one.name, str(one.judged), *errors, *shares, since)
+    return Measured(
+        f"mean of medians {np.mean([one.median_mm for one in found]):.2f} mm, learnt from the "
+        f"first {train} presses of each skin",
+        rows,
+        "in σ: coordinates within one reported standard uncertainty, 68 % where that is "
+        "right; taught: presses of which the like was taught; since then: medians of the "
+        "quarters of all later presses.",
+        {"skins": [asdict(one) for one in found]},
+    )
+
+
 KINDS: Final = (
-    Kind(("dv", "truth", "name"), "tank_uef2017", saline_tanks),
-    Kind(("lookup", "dv", "pos_m"), "skin_round", round_skin),
+    Kind(("dv", "truth", "name"), "tank_uef2017", _saline_tanks),
+    Kind(("lookup", "dv", "pos_m"), "skin_round", _round_skin),
+    Kind(("injection", "measurement", "reference", "voltages"), "tank_ktc2023", _challenge),
+    Kind(("*_voltages", "*_xy_mm"), "skin_round", _taught_skins),
 )
+
+
+def _tell(path: Path, as_json: bool, measure: Callable[[], Measured], of_sets: bool) -> None:
+    """Measure a set and print what came out; as JSON by its name, where one of several kinds."""
+    import scipy.linalg  # noqa: F401  # the limit is of libraries that are loaded
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1):  # more threads wait for each other where others compute, too
+        found = measure()
+
+    def show(console: Console) -> None:
+        console.print(f"measured, {path.name}: {found.ours}")
+        console.print(found.table)
+        console.print(found.caption, style="dim")
+
+    facts = {"sets": {path.name: found.facts}} if of_sets else found.facts
+    tell({"simulated": False, **facts}, as_json, show)
 
 
 @app.command(
@@ -125,16 +187,14 @@ KINDS: Final = (
     )
 )
 def measured(
-    path: Annotated[
-        Path, typer.Argument(metavar="FILE.npz", help="A public set, or one of your own.")
-    ],
+    path: File,
     sensor: Annotated[
         str | None,
         typer.Option("--description", "-d", help="Sensor of FILE. [the public set's]"),
     ] = None,
     as_json: JsonOutput = False,
 ) -> None:
-    """Evaluate a measured set; prints Markdown.
+    """Evaluate a measured set of any kind.
 
     The arrays of FILE tell its kind. *Tanks with objects*: `dv` (n, M), the
     increase of each voltage by the objects, on one unknown scale common to all; `truth` (n, rows,
@@ -143,18 +203,13 @@ def measured(
     image with the truth over the disc; the network's confidence is the expected correlation.
     *Presses of a robot*: `lookup` (M, 4), the source, sink, v+ and v- electrode of each voltage;
     `dv` (n, M); `pos_m` (n, 2), the places in the robot's frame. Some presses fit the skin's place
-    in that frame, the others judge it. `tactomo evaluate ktc` and `presses` take the other sets of
-    docs/measured.md, which has the best published figures beside ours.
+    in that frame, the others judge it. *The challenge's tanks* and *presses on unknown skins*: see
+    `tactomo evaluate ktc` and `presses`, which have options of their own. docs/measured.md has the
+    best published figures beside ours.
     """
-    from threadpoolctl import threadpool_limits
-
     kind = _recognised(path)
     say(f"measuring {path.name}", err=True)
-    with threadpool_limits(1):  # more threads wait for each other where others compute, too
-        found = kind.measure(path, sensor or kind.description)
-    text = "\n".join([f"{path.name}: {found.ours}", "", *found.details])
-    told = {"simulated": False, "sets": {path.name: found.facts}}
-    tell(told, as_json, lambda _: say(text))
+    _tell(path, as_json, lambda: kind.measure(path, sensor or kind.description), of_sets=True)
 
 
 def _recognised(path: Path) -> Kind:
@@ -166,25 +221,13 @@ def _recognised(path: Path) -> Kind:
 
     names = list(read_set(path, "measured scans"))
     for each in KINDS:
-        if set(each.arrays) <= set(names):
+        if all(matching(names, pattern) for pattern in each.arrays):
             return each
     known = "; ".join(", ".join(each.arrays) for each in KINDS)
     raise TactomoError(
         f"{path} is no set of measured scans: it holds {', '.join(names) or 'nothing'}",
         f"give the arrays of one: {known}",
     )
-
-
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    lines = [heads, ["---"] * len(heads), *rows]
-    return ["", *(f"| {' | '.join(cells)} |" for cells in lines), ""]
-
-
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values)
-
-
-# ------------------------------------------------------------------ one kind of set each
 
 
 @app.command(
@@ -194,7 +237,7 @@ def _mean(values: Sequence[float]) -> float:
     )
 )
 def ktc(
-    file: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Tanks (format above).")],
+    file: File,
     level: Annotated[
         int | None,
         typer.Option(min=1, max=7, help="Leave out the electrodes that this level has lost."),
@@ -214,28 +257,7 @@ def ktc(
     the objects until they explain the voltages. Level l of 1 to 7 loses the first 2 (l - 1)
     electrodes.
     """
-    from tactomo_lab.evaluation.ktc import evaluate_challenge, read_challenge
-
-    description = tank_of(sensor)
-    given = read_challenge(file, description)
-    if level is not None:
-        given = given.at_level(level)
-    tanks = list(shown(evaluate_challenge(given, description), len(given.truth), "tanks"))
-    total = sum(tank.score for tank in tanks)
-    attributes = ("level", "readings", "score", "misfit", "seconds")
-    each = [{name: getattr(tank, name) for name in attributes} for tank in tanks]
-
-    def show(console: Console) -> None:
-        made = table("tank", "level", "readings", "score", "misfit", "CPU s")
-        for number, tank in enumerate(tanks):
-            figures = f"{tank.score:.3f}", f"{tank.misfit:.2f}", f"{tank.seconds:.1f}"
-            made.add_row(str(number), str(tank.level), str(tank.readings), *figures)
-        made.add_section()
-        made.add_row("sum", "", "", f"{total:.3f}", style="bold")
-        console.print(made)
-
-    told = {"simulated": False, "score": total, "tanks": each}
-    tell(told, as_json, show)
+    _tell(file, as_json, lambda: _challenge(file, sensor, level), of_sets=False)
 
 
 @app.command(
@@ -245,7 +267,7 @@ def ktc(
     )
 )
 def presses(
-    skins: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Presses (format above).")],
+    skins: File,
     train: Annotated[int, typer.Option(min=1, help="Presses to learn from.")] = 200,
     as_json: JsonOutput = False,
 ) -> None:
@@ -256,31 +278,4 @@ def presses(
     half of the remaining presses are judged. Each skin is learnt from its own presses alone; the
     sheets' make does not matter.
     """
-    from threadpoolctl import threadpool_limits
-
-    from tactomo_lab.evaluation.taught_presses import judge, read_skins
-
-    known = read_skins(skins)
-    with threadpool_limits(1):
-        found = list(shown(judge(known, train), len(known), "skins"))
-
-    def show(console: Console) -> None:
-        made = table("error, mm", "judged", "median", "95 %", "in σ", "taught", "since then")
-        for one in found:
-            errors = (f"{one.median_mm:.2f}", f"{one.p95_mm:.1f}")
-            shares = (f"{one.within_sigma:.0%}", f"{one.is_taught:.0%}")
-            since = " ".join(f"{median:.1f}" for median in one.median_mm_since)
-            made.add_row(one.name, str(one.judged), *errors, *shares, since)
-        made.add_section()
-        means = (_mean([getattr(one, of) for one in found]) for of in ("median_mm", "p95_mm"))
-        made.add_row("mean", "", *(f"{mean:.2f}" for mean in means), style="bold")
-        console.print(f"measured presses, learnt from the first {train} of each skin")
-        console.print(made)
-        console.print(
-            "in σ: coordinates within one reported standard uncertainty, 68 % where that is "
-            "right; taught: presses of which the like was taught; since then: medians of the "
-            "quarters of all later presses.",
-            style="dim",
-        )
-
-    tell({"skins": [asdict(one) for one in found]}, as_json, show)
+    _tell(skins, as_json, lambda: _taught_skins(skins, "", train), of_sets=False)

@@ -43,7 +43,7 @@ def test_tanks_are_known_by_their_arrays(tactomo: Run, tank: Path, tmp_path: Pat
     assert facts["mean_correlation"]["noser"] == pytest.approx(np.mean(noser))
     assert 0.4 < np.mean(noser) < 1
     words = tactomo(*asked).stdout
-    for heading in ("two.npz", "tuning 0", "tuning 1", "tikhonov", "noser", "network"):
+    for heading in ("measured, two.npz", "tuning 0", "tuning 1", "tikhonov", "noser", "network"):
         assert heading in words
 
 
@@ -62,7 +62,7 @@ def test_presses_in_numbers_and_words(tactomo: Run, tmp_path: Path) -> None:
     told = json.loads(result.stdout)["sets"]["presses.npz"]
     assert told["presses"] == 40
     noise = told["methods"]["NOSER image"]  # of which nothing can be located
-    assert noise["median_mm"] > 0.7 * told["methods"]["mean position (no measurement)"]["median_mm"]
+    assert noise["median_mm"] > 15
     assert noise["most_mm"] > noise["median_mm"]
     result = tactomo("evaluate", "measured", tmp_path / "presses.npz")
     assert "taught by" in result.stdout
