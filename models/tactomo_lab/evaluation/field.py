@@ -110,6 +110,11 @@ def cases_of_row(
     def mixed(noise_of: NoiseOf) -> Iterator[Case]:
         return (mixed_sequence(description, seed_set, number, noise_of) for number in numbers)
 
+    def days(is_followed: bool) -> Iterator[Case]:
+        return (
+            draw_day(description, seed_set, number, is_followed=is_followed) for number in numbers
+        )
+
     if row == "ordinary":
         return {f"{row} {snr_db:g} dB": still(SCENE_SHAPES, snr_db) for snr_db in ORDINARY_DB}
     if row == "rectangles-rings":
@@ -117,13 +122,7 @@ def cases_of_row(
     if row == "palm":
         return {row: (palm_sequence(description, seed_set, number) for number in range(count))}
     if row == DAYS:
-        return {
-            f"{row}, {what}": (
-                draw_day(description, seed_set, number, is_followed=is_followed)
-                for number in numbers
-            )
-            for what, is_followed in (("reference follows", True), ("one tare", False))
-        }
+        return {f"{row}, reference follows": days(True), f"{row}, one tare": days(False)}
     if row == "moving":
         return {row: (draw_sequence(description, seed_set, number) for number in numbers)}
     if row == "mixed-moving":
