@@ -51,7 +51,7 @@ def _group() -> None:
         "tactomo evaluate field",
         "tactomo evaluate field --rows soft,graded --method fit --count 30",
         "tactomo evaluate field --seeds reporting --count 50 --json > field.json",
-        "tactomo evaluate field --rows ordinary --method tikhonov --picture tikhonov.png",
+        "tactomo evaluate field --rows ordinary --picture scenes.png",
         "tactomo evaluate field --rows graded,mixed --companion 0.05",
         "tactomo evaluate field --rows regimes --method auto,fit --picture flags.png",
     )
