@@ -38,13 +38,14 @@ def press(twin: Twin, x_mm: float, y_mm: float, radius_mm: float = 9.0) -> None:
     request("press", twin.control, PATIENCE_S, x_mm=x_mm, y_mm=y_mm, radius_mm=radius_mm)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("protocol", "board", "changes"),
     [
         ("matrix", "matrix_disc", (*WAITING, *SIXTEENTHS)),
-        pytest.param("openeit", "openeit_disc", (), marks=pytest.mark.slow),
-        pytest.param("matrix", "matrix_disc", SINGLE_ENDED, marks=pytest.mark.slow),
-        pytest.param("matrix", "matrix_square", (), marks=pytest.mark.slow),
+        ("openeit", "openeit_disc", ()),
+        ("matrix", "matrix_disc", SINGLE_ENDED),
+        ("matrix", "matrix_square", ()),
     ],
     ids=["matrix", "openeit", "single-ended", "32 electrodes"],
 )

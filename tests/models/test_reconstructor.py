@@ -360,7 +360,10 @@ def test_a_scan_of_the_wrong_length_is_refused(reconstructor: Reconstructor) -> 
         reconstructor.reconstruct(np.zeros(192), None)
 
 
-@pytest.mark.parametrize("voltages", ["opposite electrodes' order", "shifted by five"])
+@pytest.mark.parametrize(
+    "voltages",
+    ["opposite electrodes' order", pytest.param("shifted by five", marks=pytest.mark.slow)],
+)
 def test_a_reference_of_another_sensor_is_flagged(
     paper: SensorDescription, artifact: Artifact, skin: Skin, voltages: str
 ) -> None:

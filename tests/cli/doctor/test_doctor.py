@@ -319,7 +319,7 @@ def test_a_healthy_skin_on_a_busy_computer_is_healthy(demo: Demo) -> None:
 
 
 def test_a_running_daemon(tactomo: Run, demo: Demo) -> None:
-    look = ("doctor", "-s", SENSOR, "--address", demo.stream, "--seconds", "2", "--json")
+    look = ("doctor", "-s", SENSOR, "--address", demo.stream, "--seconds", "1", "--json")
     request("tare", demo.control, PATIENCE_S)
     found = report(tactomo(*look))
     for channel in found["channels"].values():

@@ -168,7 +168,13 @@ def bump(forward: ForwardModel, place: tuple[float, float]) -> FloatArray:
     return np.asarray(np.exp(-((x - place[0]) ** 2 + (y - place[1]) ** 2) / (2 * 0.01**2)))
 
 
-@pytest.mark.parametrize(("name", "place"), [("palm_l", (-0.03, -0.03)), ("insole", (0.0, 0.06))])
+@pytest.mark.parametrize(
+    ("name", "place"),
+    [
+        ("palm_l", (-0.03, -0.03)),
+        pytest.param("insole", (0.0, 0.06), marks=pytest.mark.slow),
+    ],
+)
 def test_voltages_converge_and_the_jacobian_passes_a_taylor_test(
     name: str, place: tuple[float, float]
 ) -> None:

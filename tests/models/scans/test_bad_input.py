@@ -1,8 +1,7 @@
 """Bad input is flagged where the data can show it, and never makes a confident wrong map.
 
 What the data cannot show is here, too: an order of electrodes that is a symmetry of the sheet, and
-a bad contact of an ideal device. What is said for one frame here is counted over many in
-`test_bad_input_rates.py`, a slow test.
+a bad contact of an ideal device.
 """
 
 from __future__ import annotations
@@ -269,7 +268,12 @@ def test_swapped_channels_are_told(show: Show) -> None:
 
 @pytest.mark.parametrize(
     ("channel", "gain"),
-    [("magnitude", 0.5), ("magnitude", 1.3), ("structure", 0.7), ("structure", 2.0)],
+    [
+        ("magnitude", 0.5),
+        pytest.param("magnitude", 1.3, marks=pytest.mark.slow),
+        pytest.param("structure", 0.7, marks=pytest.mark.slow),
+        ("structure", 2.0),
+    ],
 )
 def test_a_gain_that_changes_is_told_as_one_and_not_as_a_swap(
     reconstructor: Reconstructor, skin: Skin, channel: str, gain: float
@@ -283,7 +287,7 @@ def test_a_gain_that_changes_is_told_as_one_and_not_as_a_swap(
         assert bool(is_told) == (scan is rest)
 
 
-@pytest.mark.parametrize("gain", [0.2, 0.35, 0.5])
+@pytest.mark.parametrize("gain", [0.2, pytest.param(0.35, marks=pytest.mark.slow), 0.5])
 def test_a_gain_that_a_press_of_the_whole_sheet_would_explain_is_told(
     reconstructor: Reconstructor, skin: Skin, gain: float
 ) -> None:

@@ -33,17 +33,6 @@ def test_the_paper_sensor_is_the_one_of_the_paper(paper: SensorDescription) -> N
     assert centres_mm[15] == [-75, -54]
 
 
-def test_a_scan_is_drive_major_without_touching_pairs() -> None:
-    pairs = scan_pairs(16)
-    assert pairs.drive[:13].tolist() == [[0, 1]] * 13
-    assert pairs.measure[:13].tolist() == [[m, (m + 1) % 16] for m in range(2, 15)]
-    assert pairs.measure[13:16].tolist() == [[3, 4], [4, 5], [5, 6]]
-
-
-def test_opposite_drive_gives_192_voltages() -> None:
-    assert len(scan_pairs(16, drive_offset=8).drive) == 192
-
-
 def structure_table(ratios: str) -> str:
     """A structure channel's table of conductivity ratios, as a description has it."""
     return f"[structure.response]\npressure_kpa = [0, 50, 100]\nconductivity_ratio = {ratios}"
