@@ -9,24 +9,19 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from rich.progress import Progress
-from tactomo.cli.console import Console
-from tactomo.cli.output import say, table
+from tactomo.cli.output import say
 from tactomo.cli.plot.plot import prepare_picture, save_figure
 from tactomo_models import available_methods, load_description
 
 from tactomo_lab.commands.report import shown, usable
 from tactomo_lab.evaluation import trade_off
 from tactomo_lab.evaluation.moving import mixed_sequence
+from tactomo_lab.evaluation.play import play
 from tactomo_lab.evaluation.regimes import make_case
 from tactomo_lab.scenes.case import Case
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 STILL_SNR_DB: Final = (40.0, 20.0, 10.0)
 CONTACTS: Final = 4  # mixed scenes have one to so many, in turns
@@ -45,11 +40,8 @@ MEASURES: Final = (
 
 def chart(
     name: str, picture: Path, count: int, machine: str, methods: Sequence[str] = ()
-) -> tuple[list[dict[str, Any]], Table]:
-    """Measure methods, and write the picture.
-
-    Returns:
-        A row for each point of the chart, and a table of the Pareto fronts to print.
+) -> list[dict[str, Any]]:
+    """Measure methods, write the picture, and return a row for each point of the chart.
 
     Raises:
         TactomoError: the picture cannot be written, or matplotlib is missing.
@@ -69,12 +61,7 @@ def chart(
     )
     save_figure(draw_chart(points, title), picture)
     say(f"wrote {picture}", err=True)
-    return rows_of(points), table_of(points)
-
-
-def sequences(count: int) -> int:
-    """Return how many moving scenes go with `count` still ones of each number of contacts."""
-    return -(-count // SCENES_A_SEQUENCE)
+    return rows_of(points)
 
 
 def measure_chart(
@@ -87,33 +74,29 @@ def measure_chart(
     """
     sensor = load_description(name)
     methods = usable(sensor, methods or available_methods())
-    scenes, points = count * CONTACTS, []
-
-    def still(snr_db: float) -> Iterator[Case]:
-        return (make_case(sensor, "mixed", SEEDS, n, snr_db=snr_db) for n in range(scenes))
-
-    drawn = [
-        list(shown(still(snr_db), scenes, f"simulating still scenes, {snr_db:g} dB"))
-        for snr_db in STILL_SNR_DB
-    ]
-    moving = [
-        mixed_sequence(sensor, SEEDS, number, "each change")
-        for number in shown(range(sequences(count)), sequences(count), "simulating moving scenes")
-    ]
-    frames = sum(len(case.frames) for case in moving)
-    progress = Progress(console=Console(stderr=True), transient=True)
-    with _warned_if_busy() as warnings, progress:
-        for cases, budgets_s in (
-            *((each, trade_off.STILL_BUDGETS_S) for each in drawn),
-            (moving, trade_off.BUDGETS_S),
-        ):
+    scenes = count * CONTACTS
+    drawn: list[tuple[str, Sequence[float], list[Case]]] = []
+    for snr_db in STILL_SNR_DB:
+        what = f"still scenes, {snr_db:g} dB"
+        mixed = (make_case(sensor, "mixed", SEEDS, n, snr_db=snr_db) for n in range(scenes))
+        made = list(shown(mixed, scenes, f"simulating {what}"))
+        drawn.append((what, trade_off.STILL_BUDGETS_S, made))
+    numbers = range(sequences(count))
+    moving = (mixed_sequence(sensor, SEEDS, number, "each change") for number in numbers)
+    made = list(shown(moving, len(numbers), "simulating moving scenes"))
+    drawn.append(("moving scenes", trade_off.BUDGETS_S, made))
+    points = []
+    with _warned_if_busy() as warnings:
+        for what, budgets_s, cases in drawn:
             asked = trade_off.variants(methods, budgets_s)
-            kind = f"{'still' if cases[0].is_still else 'moving'} scenes"
-            what = f"measuring on {kind}, {cases[0].plan.snr_db:g} dB"
-            total = len(asked) * (frames if cases is moving else len(cases))
-            task = progress.add_task(what, total=total)
-            points += trade_off.measure(cases, asked, partial(progress.advance, task))
+            total = len(asked) * sum(len(case.frames) for case in cases)
+            points += trade_off.points_of(shown(play(cases, *asked), total, f"measuring on {what}"))
     return points, warnings
+
+
+def sequences(count: int) -> int:
+    """Return how many moving scenes go with `count` still ones of each number of contacts."""
+    return -(-count // SCENES_A_SEQUENCE)
 
 
 @contextmanager
@@ -140,7 +123,7 @@ def rows_of(points: Sequence[trade_off.Point]) -> list[dict[str, Any]]:
     rows = []
     for panel in trade_off.panels(points):
         front = trade_off.pareto_front(panel)
-        for point in sorted(panel, key=lambda p: p.p50_s):
+        for point in sorted(panel, key=lambda p: p.summary.seconds):
             summary, budget_s = point.summary, point.variant.budget_s
             rows.append(
                 {
@@ -155,27 +138,3 @@ def rows_of(points: Sequence[trade_off.Point]) -> list[dict[str, Any]]:
                 }
             )
     return rows
-
-
-def table_of(points: Sequence[trade_off.Point]) -> Table:
-    """Lay out the Pareto fronts: that than which nothing is both faster and more right."""
-    made = table(
-        *("scenes", "method", "p50 ms", "p99 ms", "ICC", "worst", "count", "wrong"),
-        left=("method",),
-        title="Pareto fronts (simulated, one thread): the best for its time",
-    )
-    for panel in trade_off.panels(points):
-        for point in trade_off.pareto_front(panel):
-            of = point.summary
-            made.add_row(
-                f"{point.scene}, {point.snr_db:g} dB",
-                str(point.variant),
-                f"{of.seconds * 1e3:.1f}",
-                f"{of.seconds_99 * 1e3:.1f}",
-                f"{of.icc:.3f}",
-                f"{of.icc_worst:.2f}",
-                f"{of.count_right:.0%}",
-                f"{of.confidently_wrong:.0%}",
-            )
-        made.add_section()
-    return made

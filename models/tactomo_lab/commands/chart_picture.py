@@ -90,7 +90,7 @@ def _draw_panel(axes: Any, panel: Sequence[Point], styles: dict[str, Style], siz
     if panel[0].scene == "moving":
         axes.axvline(FRAME_MS, **FRAME)
     if front:
-        x, y = [p.p50_s * 1e3 for p in front], [p.icc for p in front]
+        x, y = [p.summary.seconds * 1e3 for p in front], [p.summary.icc for p in front]
         axes.step([*x, PAPER_MS], [*y, y[-1]], where="post", zorder=1, **FRONT)
     for method in dict.fromkeys(point.variant.method for point in panel):
         _draw_method(axes, [p for p in panel if p.variant.method == method], front, styles, sizes)
@@ -108,8 +108,8 @@ def _draw_method(
     """Draw a method's points, joined from its smallest budget to its largest."""
     colour, marker = styles[series[0].variant.method]
     axes.plot(
-        [p.p50_s * 1e3 for p in series],
-        [_shown(p.icc) for p in series],
+        [p.summary.seconds * 1e3 for p in series],
+        [_shown(p.summary.icc) for p in series],
         color=colour,
         linewidth=1,
         alpha=PALE,
@@ -118,9 +118,9 @@ def _draw_method(
     for point in series:
         best = point in front
         axes.errorbar(
-            point.p50_s * 1e3,
-            _shown(point.icc),
-            xerr=[[0.0], [max(0.0, point.summary.seconds_99 - point.p50_s) * 1e3]],
+            point.summary.seconds * 1e3,
+            _shown(point.summary.icc),
+            xerr=[[0.0], [max(0.0, point.summary.seconds_99 - point.summary.seconds) * 1e3]],
             color=colour,
             marker=marker,
             markersize=sizes[point.variant.budget_s],
@@ -150,7 +150,7 @@ def _shown(icc: float) -> float:
 
 def _set_axes(grid: Any, points: Sequence[Point]) -> None:
     """Stretch ICC towards 1: half of what is missing is as far up everywhere."""
-    icc = np.array([_shown(p.icc) for p in points if np.isfinite(p.icc)])
+    icc = np.array([_shown(p.summary.icc) for p in points if np.isfinite(p.summary.icc)])
     least, most = (-np.log10(1 - value) for value in (icc.min(), icc.max()))
     margin = 0.08 * max(most - least, 0.5)
     for axes in grid.flat:

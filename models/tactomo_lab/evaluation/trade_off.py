@@ -8,7 +8,7 @@ that takes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -19,12 +19,10 @@ from tactomo_models.methods.registry import BUDGETED, check_method
 from tactomo_models.reconstruct import DEFAULT_BUDGET_S
 from tactomo_models.sensor.description import SensorDescription
 
-from tactomo_lab.evaluation.play import Variant, play
-from tactomo_lab.scenes.case import Case
+from tactomo_lab.evaluation.play import Outcome, Variant
 from tactomo_lab.scenes.measures import Score, Summary, summarise
 
 SceneKind = Literal["still", "moving"]
-Done = Callable[[], None]
 
 UNHURRIED: Final = ("levelset",)  # charted under the last budget alone
 BUDGETS_S: Final = (0.001, 0.002, 0.005, 0.01, 0.02, DEFAULT_BUDGET_S)
@@ -52,30 +50,15 @@ class Point:
     variant: Variant
     summary: Summary
 
-    @property
-    def icc(self) -> float:
-        """Mean correlation of the maps with the truth."""
-        return self.summary.icc
 
-    @property
-    def p50_s(self) -> float:
-        """Median processor time of a frame."""
-        return self.summary.seconds
-
-
-def measure(
-    cases: Sequence[Case], variants: Sequence[Variant], done: Done = lambda: None
-) -> list[Point]:
-    """Play cases of one kind and one ratio; `done` is called after each frame."""
-    scores: dict[Variant, list[Score]] = {variant: [] for variant in variants}
-    for outcome in play(cases, *variants):
-        scores[outcome.variant].append(outcome.score)
-        done()
-    first = cases[0]
-    kind: SceneKind = "still" if first.is_still else "moving"
-    return [
-        Point(kind, first.plan.snr_db, variant, summarise(own)) for variant, own in scores.items()
-    ]
+def points_of(outcomes: Iterable[Outcome]) -> list[Point]:
+    """What became of cases, one point for each kind of scene, ratio and variant."""
+    scores: dict[tuple[SceneKind, float, Variant], list[Score]] = {}
+    for outcome in outcomes:
+        kind: SceneKind = "still" if outcome.case.is_still else "moving"
+        of = (kind, outcome.score.snr_db, outcome.variant)
+        scores.setdefault(of, []).append(outcome.score)
+    return [Point(*of, summarise(own)) for of, own in scores.items()]
 
 
 def left_out(description: SensorDescription, methods: Iterable[str]) -> dict[str, str]:
@@ -99,11 +82,11 @@ def panels(points: Iterable[Point]) -> Iterator[list[Point]]:
 
 def pareto_front(points: Sequence[Point]) -> list[Point]:
     """Points than which none is both as fast and as right, and better in one; fastest first."""
-    known = [point for point in points if np.isfinite(point.icc)]
+    known = [point for point in points if np.isfinite(point.summary.icc)]
     best = [one for one in known if not any(_dominates(other, one) for other in known)]
-    return sorted(best, key=lambda point: point.p50_s)
+    return sorted(best, key=lambda point: point.summary.seconds)
 
 
 def _dominates(one: Point, other: Point) -> bool:
-    as_good = one.p50_s <= other.p50_s and one.icc >= other.icc
-    return as_good and (one.p50_s < other.p50_s or one.icc > other.icc)
+    a, b = ((point.summary.seconds, -point.summary.icc) for point in (one, other))
+    return a != b and a[0] <= b[0] and a[1] <= b[1]

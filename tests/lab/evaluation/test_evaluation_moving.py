@@ -17,8 +17,7 @@ from tactomo_lab.evaluation.moving import (
     draw_sequence,
     follow,
 )
-from tactomo_lab.evaluation.play import Variant, play
-from tactomo_lab.evaluation.trade_off import measure
+from tactomo_lab.evaluation.play import play
 from tactomo_lab.scenes.case import Case, Simulated, SimulatedVolts, as_described
 from tactomo_lab.scenes.drawing import BOTH_CHANNELS, GAP_M, gap_m, outline_of
 from tactomo_lab.scenes.measures import Score
@@ -177,19 +176,3 @@ def test_a_sequence_is_drawn_once_and_kept(
     assert rest is not None
     std = 0.01 * np.sqrt(np.mean((np.array(loaded) - rest) ** 2))
     assert np.std(np.array(at_rest) - rest) == pytest.approx(std, rel=0.15)
-
-
-@pytest.mark.slow
-def test_speed_and_accuracy_are_of_all_frames(
-    paper: SensorDescription, simulator: SkinSimulator
-) -> None:
-    scene = sequence(paper, simulator, Step("rest", {}), *[Step("still", {"A": press("A")})] * 2)
-    done: list[None] = []
-    points = measure([scene], [Variant("noser"), Variant("fit", 0.05)], lambda: done.append(None))
-    assert [(p.scene, p.snr_db, str(p.variant), p.summary.frames) for p in points] == [
-        ("moving", 40.0, "noser", 3),
-        ("moving", 40.0, "fit, 50 ms", 3),
-    ]
-    assert len(done) == 6
-    assert points[0].icc < points[1].icc < 1
-    assert 0 < points[0].p50_s <= points[0].summary.seconds_99

@@ -136,13 +136,11 @@ def bench(
 
 
 def _chart(results: Results, picture: Path, count: int, methods: list[str], as_json: bool) -> None:
-    results.chart, fronts = measurement("chart")(
+    results.chart = measurement("chart")(
         results.description, picture, count, results.machine, methods
     )
     if as_json:
         print_json(asdict(results))
-    else:
-        _console(results).print(fronts)
 
 
 def _measure_twin(
