@@ -25,8 +25,8 @@ EXTRA = (
 )
 INTERRUPTED = 130
 
-# The models' CONFIGURATIONS, which are not imported for a command line that only shows its help.
-ConfigurationName: TypeAlias = Literal["ours", "ours-small", "ours-single"]
+# The models' WIDTHS, which are not imported for a command line that only shows its help.
+ConfigurationName: TypeAlias = Literal["ours", "ours-small"]
 
 app = typer_app()
 
@@ -78,7 +78,6 @@ def simulate(
     epilog=examples(
         "tactomo models train scenes/robust",
         "tactomo models train scenes/robust --epochs 5 --output trial.onnx",
-        "tactomo models train scenes/robust --start ours.pt --checkpoint more.pt",
     )
 )
 def train(
@@ -94,10 +93,6 @@ def train(
     ] = None,
     rate: Annotated[
         float | None, typer.Option(min=1e-6, max=1.0, help="Learning rate. [the configuration's]")
-    ] = None,
-    start: Annotated[
-        Path | None,
-        typer.Option(help="Begin with the weights of this checkpoint."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of weights, order, noise and turns.")] = 0,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="Device that computes.")] = "cpu",
@@ -120,9 +115,8 @@ def train(
     Some scenes are held out; the command shows the correlation (ICC) of their maps with the truth,
     by noise and number of contacts.
 
-    *ours* takes both channels' voltages; *ours-small* is half as wide; *ours-single* takes the
-    magnitude channel alone. Each takes one to two hours on two cores. A few more epochs with
-    --start and a lower --rate finish a shorter training.
+    *ours* takes the voltages of all channels; *ours-small* is half as wide. Each takes one to two
+    hours on two cores.
 
     tactomo then uses the network in the cache for this sensor, instead of the shipped network;
     delete the file to return to the shipped one. Needs `pip install 'tactomo-lab[train]'`.
@@ -144,7 +138,7 @@ def train(
             seed=seed,
             device=device,
         )
-        prepared = _prepare(configuration, folder, description, seed, start)
+        prepared = _prepare(configuration, folder, description, seed)
         kept = checkpoint or folder / f"{configuration}.pt"
         training = _train(prepared, settings, kept, configuration)
         written = output or own_path(description, KIND)
@@ -163,16 +157,16 @@ def train(
 
 
 def _prepare(
-    configuration: str, folder: Path, description: SensorDescription, seed: int, start: Path | None
+    configuration: str, folder: Path, description: SensorDescription, seed: int
 ) -> Prepared:
     """Read the scenes."""
     from rich.text import Text
     from tactomo.cli.console import Console
 
-    from tactomo_lab.training.configurations import CONFIGURATIONS, prepare
+    from tactomo_lab.training.configurations import WIDTHS, prepare
 
     with Console(stderr=True).status(Text(f"reading {folder}")):
-        return prepare(CONFIGURATIONS[configuration], folder, description, seed, start)
+        return prepare(WIDTHS[configuration], folder, description, seed)
 
 
 def _train(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from base64 import b64encode
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,36 +26,22 @@ from tactomo_lab.scenes.measures import full_range
 from tactomo_lab.training.batches import SceneBatches
 from tactomo_lab.training.networks import FusionNetwork
 from tactomo_lab.training.objectives import FusionObjective, linear_images
-from tactomo_lab.training.train import Settings, Training, load_weights
+from tactomo_lab.training.train import Settings, Training
 
 OPSET: Final = 18
 MIN_HALVED: Final = 1024  # numbers of a weight that is stored in half precision
-BOTH: Final[tuple[Channel, ...]] = (Channel.MAGNITUDE, Channel.STRUCTURE)
-
-
-@dataclass(frozen=True)
-class Configuration:
-    """How a network is made."""
-
-    channels: tuple[Channel, ...]
-    width: int
 
 
 KIND: Final = "network"
 SETTINGS: Final = Settings(epochs=40, batch=64)
 
-CONFIGURATIONS: Final[dict[str, Configuration]] = {
-    "ours": Configuration(BOTH, 24),
-    "ours-small": Configuration(BOTH, 12),
-    "ours-single": Configuration((Channel.MAGNITUDE,), 24),
-}
+WIDTHS: Final = {"ours": 24, "ours-small": 12}  # of networks, by their configuration
 
 
 @dataclass(frozen=True)
 class Prepared:
     """A network before its first step, and what it is trained on."""
 
-    configuration: Configuration
     description: SensorDescription
     network: FusionNetwork
     objective: FusionObjective
@@ -63,30 +49,19 @@ class Prepared:
     bases: Mapping[Channel, FloatArray]
 
 
-def prepare(
-    configuration: Configuration,
-    folder: Path,
-    description: SensorDescription,
-    seed: int = 0,
-    start: Path | None = None,
-) -> Prepared:
+def prepare(width: int, folder: Path, description: SensorDescription, seed: int = 0) -> Prepared:
     """Read the scenes and make the network.
 
     Raises ModelError where the scenes are of another sensor, or something is missing.
     """
     torch.manual_seed(seed)
     scale = full_range(description)
-    there = tuple(name for name in configuration.channels if name in description.channels)
-    configuration = replace(configuration, channels=there)
     forward = ForwardModel(description, load_or_build_artifact(description).bare)
-    batches = SceneBatches(folder, description, configuration.channels, forward)
-    network = FusionNetwork(batches.inputs, batches.nodes, configuration.width, scale)
-    bases = dict(zip(configuration.channels, batches.bases, strict=True))
-    if start is None:
-        network.start_linear(linear_images(batches, scale))
-    else:
-        load_weights(network, start)
-    return Prepared(configuration, description, network, FusionObjective(batches), scale, bases)
+    batches = SceneBatches(folder, description, description.channels, forward)
+    network = FusionNetwork(batches.inputs, batches.nodes, width, scale)
+    bases = dict(zip(description.channels, batches.bases, strict=True))
+    network.start_linear(linear_images(batches, scale))
+    return Prepared(description, network, FusionObjective(batches), scale, bases)
 
 
 def export_trained(prepared: Prepared, training: Training, path: Path) -> None:
@@ -123,7 +98,7 @@ def _notes(prepared: Prepared, training: Training) -> dict[str, str]:
         "kind": KIND,
         "sensor": prepared.description.name,
         "sha256": prepared.description.sha256,
-        CHANNELS_KEY: " ".join(prepared.configuration.channels),
+        CHANNELS_KEY: " ".join(prepared.description.channels),
         "scale": repr(prepared.scale),
         "trained": f"{len(training.history)} epochs, {prepared.objective.scenes} scenes",
         "bases": b64encode(packed.getvalue()).decode(),

@@ -176,27 +176,6 @@ def save_checkpoint(training: Training, settings: Settings, path: Path) -> None:
         ) from error
 
 
-def load_weights(network: nn.Module, checkpoint: Path) -> None:
-    """Give a network the averaged weights of another training's checkpoint.
-
-    Raises ModelError where it is damaged, or of another network.
-    """
-    try:
-        network.load_state_dict(_read(checkpoint)["averaged"])
-    except (RuntimeError, KeyError) as error:
-        raise ModelError(f"{checkpoint} is of another network: name another file") from error
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-    except OSError as error:
-        raise ModelError(f"cannot read {path}: {error.strerror}; name another file") from error
-    except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        raise ModelError(_damaged(path)) from error
-    return state
-
-
 def _damaged(path: Path) -> str:
     return f"{path} is no checkpoint, or a damaged one: name another, or delete it to begin anew"
 
@@ -206,7 +185,12 @@ def load_checkpoint(training: Training, settings: Settings, path: Path) -> None:
 
     Raises ModelError where it is damaged, or of other settings or another network.
     """
-    state = _read(path)
+    try:
+        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    except OSError as error:
+        raise ModelError(f"cannot read {path}: {error.strerror}; name another file") from error
+    except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        raise ModelError(_damaged(path)) from error
     try:
         before = Settings(**state["settings"])
         history = [Epoch(**epoch) for epoch in state["history"]]

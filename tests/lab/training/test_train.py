@@ -15,7 +15,7 @@ import torch
 from small_sensor import SMALL
 from tactomo_lab.commands.training import ConfigurationName
 from tactomo_lab.training.batches import Batch, SceneBatches
-from tactomo_lab.training.configurations import CONFIGURATIONS, Prepared, export_trained, prepare
+from tactomo_lab.training.configurations import WIDTHS, Prepared, export_trained, prepare
 from tactomo_lab.training.train import (
     Settings,
     Training,
@@ -73,7 +73,7 @@ def robust(square: SensorDescription, tmp_path_factory: pytest.TempPathFactory) 
 @pytest.fixture(scope="session")
 def ours(robust: Path, square: SensorDescription) -> Prepared:
     """Our network, far narrower than it ships, before its first step."""
-    return prepare(replace(CONFIGURATIONS["ours"], width=6), robust, square)
+    return prepare(6, robust, square)
 
 
 def begun(prepared: Prepared, settings: Settings = TINY) -> Training:
@@ -109,7 +109,7 @@ def test_a_network_of_one_sheet_sees_that_sheet(
 ) -> None:
     alone = variant(square, structure=None)
     folder = simulated(20, alone, tmp_path_factory)
-    prepared = prepare(replace(CONFIGURATIONS["ours"], width=6), folder, alone)
+    prepared = prepare(6, folder, alone)
     training = begun(prepared)
     assert len(list(train(training, prepared.objective, replace(TINY, epochs=1)))) == 1
     export_trained(prepared, training, file := folder / "network.onnx")
@@ -143,9 +143,9 @@ class TestCheckpoint:
     def test_one_of_another_network_is_refused(
         self, path: Path, robust: Path, square: SensorDescription
     ) -> None:
-        single = prepare(replace(CONFIGURATIONS["ours-single"], width=6), robust, square)
+        wider = prepare(9, robust, square)
         with pytest.raises(ModelError, match="is of another network: name another file"):
-            load_checkpoint(begun(single), TINY, path)
+            load_checkpoint(begun(wider), TINY, path)
 
     def test_one_that_cannot_be_written_is_told(self, ours: Prepared, tmp_path: Path) -> None:
         (tmp_path / "file").touch()
@@ -179,14 +179,6 @@ class TestExported:
         batches: SceneBatches = ours.objective.batches
         for basis, trained in zip(running.bases.values(), batches.bases, strict=True):
             np.testing.assert_allclose(basis, trained, rtol=1e-5, atol=1e-9)
-
-    def test_one_is_no_beginning(
-        self, ours: Prepared, square: SensorDescription, robust: Path, tmp_path: Path
-    ) -> None:
-        path = tmp_path / "ours.onnx"
-        export_trained(ours, begun(ours), path)
-        with pytest.raises(ModelError, match=r"is no checkpoint.*name another"):
-            prepare(CONFIGURATIONS["ours"], robust, square, start=path)
 
 
 def test_permuted_electrodes_are_a_turned_scene(ours: Prepared, square: SensorDescription) -> None:
@@ -225,15 +217,7 @@ class TestCommand:
     def test_it_trains_exports_and_draws(
         self, tactomo: Run, robust: Path, square_file: Path, tmp_path: Path
     ) -> None:
-        command = (
-            "models",
-            "train",
-            robust,
-            "--configuration",
-            "ours-small",
-            "--description",
-            square_file,
-        )
+        command = ("models", "train", robust, "--configuration", "ours-small", "-d", square_file)
         files = ("--output", "ours.onnx", "--checkpoint", "ours.pt")
         result = tactomo(*command, *files, "--epochs", 1, "--jobs", 1, "--json")
         assert result.returncode == 0, result.stderr
@@ -283,4 +267,4 @@ class TestCommand:
 
 
 def test_the_command_offers_every_recipe() -> None:
-    assert get_args(ConfigurationName) == tuple(CONFIGURATIONS)
+    assert get_args(ConfigurationName) == tuple(WIDTHS)
