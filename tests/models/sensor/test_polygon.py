@@ -111,16 +111,6 @@ def test_electrodes_that_lie_nowhere_are_refused_by_name(
         square(None, **electrodes)
 
 
-def test_a_file_that_is_refused_names_itself(tmp_path: Path) -> None:
-    file = tmp_path / "bow.toml"
-    text = (
-        Path(__file__).parents[3] / "models/tactomo_models/sensor/shipped/palm_l.toml"
-    ).read_text("utf-8")
-    file.write_text(text.replace("[0, 0.06],\n    [-0.06, 0.06]", "[-0.06, 0.06], [0, 0.06]"))
-    with pytest.raises(DescriptionError, match=r"bow.toml: sheet.*outline_m crosses"):
-        load_description(file)
-
-
 def test_a_list_in_millimetres_is_one_complaint_that_says_so(tmp_path: Path) -> None:
     file = tmp_path / "mm.toml"
     text = (
