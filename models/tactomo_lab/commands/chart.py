@@ -33,8 +33,8 @@ MEASURES: Final = (
     "icc",
     "icc_worst",
     "count_right",
-    "distrusted",
-    "confidently_wrong",
+    "warned",
+    "bad_unflagged",
 )
 
 

@@ -19,20 +19,6 @@ if TYPE_CHECKING:
     from tactomo_lab.evaluation.play import Outcome
     from tactomo_lab.scenes.measures import Score
 
-TABLES = {
-    "maps": (
-        *("frames", "ICC", "RIE", "worst", "shape", "flagged", "silent", "wrong", "alarms"),
-        *("ms", "p99"),
-    ),
-    "contacts": (
-        *("counted", "missed", "false", "mm", "p95", "place in σ", "area in σ", "Δσ", "in σ"),
-    ),
-    "pressures": (
-        *("right to 10 %", "peak in σ", "surely wrong", "force", "forces"),
-        *("overload right", "overload wrong"),
-    ),
-}
-
 app = options.typer_app(
     name="evaluate",
     cls=Group,
@@ -163,4 +149,4 @@ def field(
             draw_outcomes(drawn, output)
 
     what = f"{description.name}, {seeds} seeds, method {told['method']}"
-    tell(told, as_json, lambda console: print_suite(console, what, TABLES, found), picture, draw)
+    tell(told, as_json, lambda console: print_suite(console, what, found), picture, draw)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, TypeVar
 
 import typer
 from tactomo.cli.output import print_json, say, table
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from tactomo.cli.console import Console
     from tactomo_models import SensorDescription
 
-    from tactomo_lab.scenes.measures import Figure
+    from tactomo_lab.scenes.measures import Summary
 
 Item = TypeVar("Item")
 
@@ -24,18 +24,58 @@ Seeds = Annotated[
 ]
 
 
-def _figures(kind: type) -> dict[str, tuple[str, Figure]]:
-    """Attributes of a kind of summaries, and their columns, by the headings of these."""
-    columns = get_type_hints(kind, include_extras=True).items()
-    return {
-        hint.__metadata__[0].heading: (attribute, hint.__metadata__[0])
-        for attribute, hint in columns
-    }
+class Column(NamedTuple):
+    """A measure's column in tables."""
+
+    attribute: str  # of `Summary`
+    form: str  # that it is printed in
+    meaning: str = ""  # where the heading does not say it
+    unit: float = 1.0  # in which it is printed, over the attribute's
 
 
-def _cell(value: float, figure: Figure) -> str:
-    value = value if figure.unit == 1.0 else value / figure.unit
-    return f"{value:{figure.form}}".replace("nan%", "-").replace("nan", "-")
+SIGMA = "within one reported standard uncertainty, 68 % where that is right"
+TABLES: Final = {
+    "maps": {
+        "frames": Column("frames", "d"),
+        "ICC": Column("icc", ".3f"),
+        "RIE": Column("rie", ".3f"),
+        "worst": Column("icc_worst", ".2f", "ICC that 95 % exceed"),
+        "shape": Column("icc_structure", ".3f", "ICC of the pressed shape"),
+        "flagged": Column("warned", ".0%", "with a flag that tells to distrust, or no map"),
+        "silent": Column("bad_unflagged", ".0%", "maps with an ICC below 0.7 and no such flag"),
+        "alarms": Column("good_flagged", ".0%", "good maps with such a flag, of the good ones"),
+        "ms": Column("seconds", ".0f", unit=1e-3),
+        "p99": Column("seconds_99", ".0f", unit=1e-3),
+    },
+    "contacts": {
+        "counted": Column("count_right", ".0%", "right"),
+        "missed": Column("missed", ".0%", "of the true contacts"),
+        "false": Column("false", ".2f", "a scene"),
+        "mm": Column("centre_mm", ".2f", "centre error, median"),
+        "p95": Column("centre_mm_95", ".1f"),
+        "place in σ": Column("place_within_sigma", ".0%"),
+        "area in σ": Column("area_within_sigma", ".0%"),
+        "Δσ": Column("magnitude_error", ".1%", "error of the magnitude, mean, share of the range"),
+        "in σ": Column("within_sigma", ".0%", SIGMA),
+    },
+    "pressures": {
+        "right to 10 %": Column("peak_right", ".0%", "peaks, of the true contacts"),
+        "peak in σ": Column("peak_within_sigma", ".0%"),
+        "surely wrong": Column(
+            *("peak_surely_wrong", ".0%"),
+            "peaks 3 reported sigmas and 10 % off, or told above a range that they lie in",
+        ),
+        "force": Column("force_error", ".1%", "error of all force, mean, where one presses"),
+        "forces": Column("force_error_several", ".1%", "the same where several press"),
+        "overload right": Column(
+            *("overload_right", ".0%"),
+            "of contacts beyond the table, told without a bound",
+        ),
+        "overload wrong": Column(
+            "overload_wrong", ".0%", "likewise, those whose 95 % interval ends below them"
+        ),
+    },
+}
 
 
 def tell(
@@ -57,27 +97,29 @@ def tell(
         say(f"wrote {picture}", err=True)
 
 
-def print_suite(
-    console: Console,
-    what: str,  # was evaluated, and how
-    tables: Mapping[str, Sequence[str]],  # by their titles, headings of the summaries' `Figure`s
-    summaries: Mapping[str, object],  # by their names
-) -> None:
-    """Print what was evaluated, and tables of what came out."""
+def print_suite(console: Console, what: str, summaries: Mapping[str, Summary]) -> None:
+    """Print what was evaluated, and tables of what came out, by its name."""
     console.print(f"Simulated, not measured: {what}.")
     if not summaries:  # every line was left out
         return
-    figures = _figures(type(next(iter(summaries.values()))))
-    for title, headings in tables.items():
-        made = table("", *headings, title=title)
+    for title, columns in TABLES.items():
+        made = table("", *columns, title=title)
         for name, summary in summaries.items():
-            columns = (figures[heading] for heading in headings)
-            made.add_row(name, *(_cell(getattr(summary, a), figure) for a, figure in columns))
+            made.add_row(name, *(_cell(summary, column) for column in columns.values()))
         console.print(made)
-    all_headings = dict.fromkeys(heading for each in tables.values() for heading in each)
-    meanings = {heading: figures[heading][1].meaning for heading in all_headings}
-    legend = "; ".join(f"{heading}: {meaning}" for heading, meaning in meanings.items() if meaning)
-    console.print(f"{legend}.", style="dim")
+    meanings = [
+        f"{heading}: {column.meaning}"
+        for columns in TABLES.values()
+        for heading, column in columns.items()
+        if column.meaning
+    ]
+    console.print(f"{'; '.join(meanings)}.", style="dim")
+
+
+def _cell(summary: Summary, column: Column) -> str:
+    value = getattr(summary, column.attribute)
+    value = value if column.unit == 1.0 else value / column.unit
+    return f"{value:{column.form}}".replace("nan%", "-").replace("nan", "-")
 
 
 def shown(items: Iterable[Item], total: int | None, what: str) -> Iterator[Item]:

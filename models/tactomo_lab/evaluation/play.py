@@ -47,26 +47,19 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class Played:
-    """A frame of a case, and what a variant of a method made of it."""
+class Outcome:
+    """A frame of a case, what a variant of a method made of it, and how right that is."""
 
     variant: Variant
     case: Case
     frame: Frame
     made: Reconstruction
-    seconds: float  # of processor time
+    score: Score
 
     @property
     def method(self) -> str:
         """The method's name."""
         return self.variant.method
-
-
-@dataclass(frozen=True)
-class Outcome(Played):
-    """... and how right that is."""
-
-    score: Score
 
 
 class Player:
@@ -78,40 +71,42 @@ class Player:
     def __init__(self, sensor: SensorDescription, method: str = "auto") -> None:
         self._reconstructor = Reconstructor(sensor, load_or_build_artifact(sensor), method=method)
         self._tare: Reference | None = None
-        self.tracker: BaselineTracker | None = None  # of the case that is played, if it is followed
+        self._tracker: BaselineTracker | None = None  # of the case that is played, if followed
 
-    def play(self, case: Case, variant: Variant) -> Iterator[Played]:
-        """Reconstruct a case's frames from a cold start.
+    def play(self, case: Case, variant: Variant) -> Iterator[Outcome]:
+        """Reconstruct and score a case's frames from a cold start.
 
         Raises ModelError where the method is not to be had for this sensor, or is the user's own
         and failed.
         """
         reconstructor = self._reconstructor
-        self.tracker = BaselineTracker(reconstructor) if case.is_followed else None
-        if self.tracker is not None or self._tare is not case.tare:
+        self._tracker = BaselineTracker(reconstructor) if case.is_followed else None
+        if self._tracker is not None or self._tare is not case.tare:
             self._take(case.tare)
         reconstructor.method = variant.method
         own_s = BUDGET_S if case.is_still else None
         reconstructor.budget_s = own_s if variant.budget_s is None else variant.budget_s
         reconstructor.reset()
+        identities: dict[str, int] = {}
         for frame in case.frames:
             if frame.tare is not None:
                 self._take(frame.tare)
             scans = frame.scans.get(Channel.MAGNITUDE), frame.scans.get(Channel.STRUCTURE)
             with threadpool_limits(1):
                 begin_s = time.thread_time()
-                if self.tracker is None:
+                if self._tracker is None:
                     made = reconstructor.reconstruct(*scans, companions=frame.companions)
                 else:
-                    made = self.tracker.reconstruct(frame.time_s, *scans)
+                    made = self._tracker.reconstruct(frame.time_s, *scans)
                 seconds = time.thread_time() - begin_s
             if made.failure:  # the frame is another method's
                 raise ModelError(made.failure)
-            yield Played(variant, case, frame, made, seconds)
+            found = score(case, frame, made, seconds, identities)
+            yield Outcome(variant, case, frame, made, found)
 
     def _take(self, tare: Reference) -> None:
         with threadpool_limits(1):
-            use = self._reconstructor.use if self.tracker is None else self.tracker.begin
+            use = self._reconstructor.use if self._tracker is None else self._tracker.begin
             use(self._reconstructor.take(tare))
         self._tare = tare
 
@@ -135,12 +130,4 @@ def play(cases: Iterable[Case], *methods: str | Variant) -> Iterator[Outcome]:
                 deque(players[sensor].play(case, variant), maxlen=0)
         for variant in variants:
             player = players[sensor] if case.is_still else Player(sensor, variant.method)
-            yield from scored(player.play(case, variant))
-
-
-def scored(played: Iterable[Played]) -> Iterator[Outcome]:
-    """Score the frames of one case, in turn."""
-    identities: dict[str, int] = {}
-    for each in played:
-        found = score(each.case, each.frame, each.made, each.seconds, identities)
-        yield Outcome(each.variant, each.case, each.frame, each.made, each.seconds, found)
+            yield from player.play(case, variant)

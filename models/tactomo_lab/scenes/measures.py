@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Annotated, Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 from tactomo_models.arrays import FloatArray
-from tactomo_models.scans.plausibility import DISTRUST, Flag
+from tactomo_models.scans.plausibility import DISTRUST
 from tactomo_models.scene.contacts import Contact
 from tactomo_models.scene.press import Press
 from tactomo_models.scene.pressure import PressureRange, described_curve
@@ -29,13 +29,11 @@ from tactomo_lab.scenes.drawing import PRESSURE_KPA, gap_m
 from tactomo_lab.scenes.simulation import TrueContact
 
 MATCH_M = 0.012  # centres farther apart belong to different contacts
-WRONG_ICC = 0.8  # a map that correlates less shows something else than what presses
 BAD_ICC = 0.7  # one that correlates less should have been flagged
 RIGHT_PEAK = 0.10  # largest relative error of a peak pressure that is right
 SURE_SIGMAS = 3.0  # standard uncertainties that an error exceeds in one of 370 honest reports
 TWO_SIDED_95 = 1.96  # standard uncertainties that 95 % of a normal distribution lie within
 FULL_RANGE_KPA = PRESSURE_KPA[1]
-NOT_WHOLE = DISTRUST | Flag.STRUCTURE_MISSING | Flag.MAGNITUDE_MISSING  # flags that tell a user
 
 
 def correlation(image: NDArray[Any] | None, truth: FloatArray) -> float:
@@ -146,8 +144,6 @@ class Score:
     icc: float
     icc_structure: float  #: of the pressed shape
     flags: tuple[str, ...]  #: names of what was flagged
-    distrusted: bool  #: whether a flag told the user not to trust the frame
-    wrong: bool  #: whether it shows something else than what presses
     has_map: bool  #: whether any was made
     tier: str  #: what made it
     #: reason, misfit, confidence: as reported
@@ -189,14 +185,9 @@ class Score:
         """Whether a flag of `DISTRUST`, or the lack of a map, told not to trust it."""
         return not self.has_map or not set(self.flags).isdisjoint(DISTRUST.names())
 
-    @property
-    def confidently_wrong(self) -> bool:
-        """Whether it shows something else than what presses, and no flag says so."""
-        return not self.distrusted and (self.wrong or self.count_right is False)
-
     def as_json(self) -> dict[str, Any]:
         """All of it as numbers and names."""
-        derived = ("count_right", "confidently_wrong", "likeness", "warned")
+        derived = ("count_right", "likeness", "warned")
         return {**asdict(self), **{name: getattr(self, name) for name in derived}}
 
 
@@ -230,9 +221,6 @@ def score(
         icc=icc,
         icc_structure=icc_structure,
         flags=tuple(made.flags.names()),
-        distrusted=bool(made.flags & NOT_WHOLE),
-        # Of a moving scene the shape counts, too: it is all that shows of a light touch.
-        wrong=icc < WRONG_ICC or (not case.is_still and icc_structure < WRONG_ICC),
         has_map=made.map is not None or made.structure is not None,
         tier=made.tier,
         reason=made.reason,
@@ -337,15 +325,6 @@ def full_range(description: SensorDescription) -> float:
     return float(np.abs(description.magnitude.response.change(np.array(FULL_RANGE_KPA))))
 
 
-class Figure(NamedTuple):
-    """A measure's column in tables."""
-
-    heading: str
-    form: str  # that it is printed in
-    meaning: str = ""  # where the heading does not say it
-    unit: float = 1.0  # in which it is printed, over the attribute's
-
-
 @dataclass(frozen=True)
 class Summary:
     """Many frames' measures. Means, where nothing else is said; NaN where nothing was measured.
@@ -353,64 +332,43 @@ class Summary:
     Shares of contacts are of the true ones; errors of the magnitude are shares of the range.
     """
 
-    frames: Annotated[int, Figure("frames", "d")]  #: of a scene one each where scenes are still
-    icc: Annotated[float, Figure("ICC", ".3f")]  #: of the magnitude map, as the RIE
-    icc_worst: Annotated[float, Figure("worst", ".2f", "ICC that 95 % exceed")]
-    rie: Annotated[float, Figure("RIE", ".3f")]
-    icc_structure: Annotated[float, Figure("shape", ".3f", "ICC of the pressed shape")]
-    count_right: Annotated[float, Figure("counted", ".0%", "right")]
-    missed: Annotated[float, Figure("missed", ".0%", "of the true contacts")]
-    false: Annotated[float, Figure("false", ".2f", "a scene")]
-    centre_mm: Annotated[float, Figure("mm", ".2f", "centre error, median")]
-    centre_mm_95: Annotated[float, Figure("p95", ".1f")]  #: 95th percentile, matched contacts
-    magnitude_error: Annotated[
-        float, Figure("Δσ", ".1%", "error of the magnitude, mean, share of the range")
-    ]
-    within_sigma: Annotated[
-        float,
-        Figure("in σ", ".0%", "within one reported standard uncertainty, 68 % where that is right"),
-    ]
-    place_within_sigma: Annotated[float, Figure("place in σ", ".0%")]  #: of x and y
-    area_within_sigma: Annotated[float, Figure("area in σ", ".0%")]
-    peak_within_sigma: Annotated[float, Figure("peak in σ", ".0%")]
+    frames: int  #: of a scene one each where scenes are still
+    #: icc, rie: of the magnitude map
+    icc: float
+    icc_worst: float  #: that 95 % exceed
+    rie: float
+    icc_structure: float  #: of the pressed shape
+    count_right: float
+    missed: float
+    false: float  #: contacts too many in a frame
+    #: centre_mm, centre_mm_95: median and 95th percentile, of matched contacts
+    centre_mm: float
+    centre_mm_95: float
+    magnitude_error: float  #: its size
+    #: within_sigma, place_within_sigma, area_within_sigma, peak_within_sigma: errors of magnitude,
+    #: of x and y, of area and peak within one reported standard uncertainty
+    within_sigma: float
+    place_within_sigma: float
+    area_within_sigma: float
+    peak_within_sigma: float
     #: `ContactScore.peak_right`, of those that the magnitude channel answers to
-    peak_right: Annotated[float, Figure("right to 10 %", ".0%", "peaks, of the true contacts")]
+    peak_right: float
     #: `ContactScore.surely_wrong`, of those told with an uncertainty or as above the range
-    peak_surely_wrong: Annotated[
-        float,
-        Figure(
-            "surely wrong",
-            ".0%",
-            "peaks 3 reported sigmas and 10 % off, or told above a range that they lie in",
-        ),
-    ]
-    overload_right: Annotated[
-        float,
-        Figure(
-            "overload right", ".0%", "of contacts beyond the response table, told without a bound"
-        ),
-    ]
-    overload_wrong: Annotated[
-        float,
-        Figure("overload wrong", ".0%", "likewise, those whose 95 % interval ends below them"),
-    ]
-    force_error: Annotated[
-        float, Figure("force", ".1%", "error of all force, mean, where one contact presses")
-    ]
-    force_error_several: Annotated[float, Figure("forces", ".1%", "the same where several press")]
-    distrusted: Annotated[float, Figure("flagged", ".0%")]  #: as not to be trusted
-    bad_unflagged: Annotated[
-        float,
-        Figure("silent", ".0%", "maps with an ICC below 0.7 and no flag that tells to distrust"),
-    ]
-    good_flagged: Annotated[
-        float, Figure("alarms", ".0%", "good maps with such a flag, of the good ones")
-    ]
-    confidently_wrong: Annotated[
-        float, Figure("wrong", ".0%", "ICC below 0.8 or another count, and no flag that says so")
-    ]
-    seconds: Annotated[float, Figure("ms", ".0f", unit=1e-3)]  #: of processor time, median
-    seconds_99: Annotated[float, Figure("p99", ".0f", unit=1e-3)]
+    peak_surely_wrong: float
+    #: overload_right, overload_wrong: `ContactScore.unbounded` and `denied`, of contacts beyond the
+    #: response table
+    overload_right: float
+    overload_wrong: float
+    #: force_error, force_error_several: its size, where one contact presses and where several do
+    force_error: float
+    force_error_several: float
+    #: warned, bad_unflagged, good_flagged: `Score.warned`, of all; bad maps without; good ones with
+    warned: float
+    bad_unflagged: float
+    good_flagged: float
+    #: seconds, seconds_99: of processor time, median and 99th percentile
+    seconds: float
+    seconds_99: float
 
 
 def summarise(scores: Sequence[Score]) -> Summary:
@@ -447,10 +405,9 @@ def summarise(scores: Sequence[Score]) -> Summary:
         overload_wrong=mean(contact.denied for contact in contacts if contact.beyond),
         force_error=mean(abs(one.force_error) for one in scores if one.groups == 1),
         force_error_several=mean(abs(one.force_error) for one in scores if one.groups > 1),
-        distrusted=mean(one.distrusted for one in scores),
+        warned=mean(one.warned for one in scores),
         bad_unflagged=mean(one.bad and not one.warned for one in scores),
         good_flagged=mean(one.warned for one in scores if not one.bad),
-        confidently_wrong=mean(one.confidently_wrong for one in scores),
         seconds=percentile(seconds, 50),
         seconds_99=percentile(seconds, 99),
     )

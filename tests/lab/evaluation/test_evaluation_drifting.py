@@ -42,8 +42,8 @@ def test_a_day_of_drift_leaves_no_ghost_and_erases_nothing(paper: SensorDescript
         summary(draw_day(paper, "reporting", 1, is_followed=way)) for way in (True, False)
     )
     assert followed.missed == followed.false == 0
-    assert bare.distrusted > 0.3
-    assert followed.distrusted < 0.01
+    assert bare.warned > 0.3
+    assert followed.warned < 0.01
     assert bare.magnitude_error > followed.magnitude_error
 
 

@@ -77,15 +77,7 @@ def test_a_contact_is_scored_in_the_units_it_says(paper: SensorDescription) -> N
 def scene(paper: SensorDescription, *found: Contact | None, **other: object) -> Score:
     contacts = tuple(score_contact(paper, TRUE, contact) for contact in found)
     known = {"contacts": contacts, "groups": len(found), "tier": "levelset"}
-    made = made_score(**known | {"found": sum(c is not None for c in found)} | other)
-    return replace(made, wrong=made.icc < 0.8)
-
-
-def test_what_is_wrong_and_does_not_say_so(paper: SensorDescription) -> None:
-    assert not scene(paper, FOUND).confidently_wrong
-    wrong = [scene(paper, FOUND, icc=0.7), scene(paper, FOUND, None), scene(paper, FOUND, found=2)]
-    assert all(one.confidently_wrong for one in wrong)
-    assert not any(replace(one, distrusted=True).confidently_wrong for one in wrong)
+    return made_score(**known | {"found": sum(c is not None for c in found)} | other)
 
 
 def test_a_summary_by_hand(paper: SensorDescription) -> None:
@@ -95,7 +87,7 @@ def test_a_summary_by_hand(paper: SensorDescription) -> None:
         [
             scene(paper, *found[:2], seconds=0.1),
             scene(paper, found[2], None, icc=0.5, seconds=0.3),
-            scene(paper, FOUND, found=3, distrusted=True, seconds=0.2),
+            scene(paper, FOUND, found=3, flags=("misfit_high",), seconds=0.2),
         ]
     )
     assert all_of.frames == 3
@@ -108,8 +100,7 @@ def test_a_summary_by_hand(paper: SensorDescription) -> None:
     assert all_of.within_sigma == pytest.approx(2 / 4)
     peaks = [replace(FOUND, peak_kpa=kpa, peak_sigma_kpa=4.0) for kpa in (177.0, 185.0, 183.0)]
     assert summarise([scene(paper, one) for one in peaks]).peak_within_sigma == pytest.approx(2 / 3)
-    assert all_of.distrusted == pytest.approx(1 / 3)
-    assert all_of.confidently_wrong == pytest.approx(1 / 3)
+    assert all_of.warned == pytest.approx(1 / 3)
     assert all_of.seconds == 0.2
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 import pytest
 from made_score import made_score
 from tactomo_lab.evaluation.field import frames_of_row
-from tactomo_lab.evaluation.play import Played, Player, Variant, play
+from tactomo_lab.evaluation.play import Outcome, play
 from tactomo_lab.evaluation.regimes import KINDS, REGIMES, draw_plan, make_case
 from tactomo_lab.scenes.case import Case, Plan
 from tactomo_lab.scenes.drawing import BOTH_CHANNELS, gap_m, outline_of
@@ -24,7 +23,6 @@ from tactomo_lab.scenes.simulation import (
 from tactomo_models import Artifact, Reconstructor, SensorDescription, build_artifact
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics import tikhonov as linear
-from tactomo_models.physics.bare_sheet import exchanged
 from tactomo_models.scene.press import Press, Profile, Shape
 from tactomo_protocol import Channel
 
@@ -59,13 +57,6 @@ def test_regimes_are_what_they_are_called(paper: SensorDescription) -> None:
     assert [len(presses) for presses in mixed] == [1, 2, 3, 4] * 2
     assert {kind(press) for presses in mixed for press in presses} == set(KINDS)
     assert max(len({kind(press) for press in presses}) for presses in mixed) >= 3
-    for press in (press for presses in mixed for press in presses):
-        least, most = (180, 300) if press.profile == "dome" else (145, 230)
-        assert least <= press.pressure_kpa <= most
-        assert press.radius_y_m is not None
-        assert 0.007 <= press.radius_y_m <= press.radius_m <= 0.020
-    for plan in plans(paper, "many"):
-        assert all(gap_m(a, b) > 0.005 for a, b in combinations(plan.frames[0], 2))
     for name, profiles in (("crowded-soft", {"dome"}), ("crowded-mixed", {"flat", "dome"})):
         crowds = [plan.frames[0] for plan in plans(paper, name)]
         assert {len(presses) for presses in crowds} == {5, 6}
@@ -74,8 +65,8 @@ def test_regimes_are_what_they_are_called(paper: SensorDescription) -> None:
         for press in plan.frames[0]:
             assert 0.0669 < np.abs(outline_of(press)).max() < 0.0691
     assert all(np.hypot(*centre(plan)) < 0.015 for plan in plans(paper, "weak-centre"))
-    light = [press.pressure_kpa for plan in plans(paper, "light") for press in plan.frames[0]]
-    assert 5 <= min(light) < max(light) <= 90
+    beyond = [plan.frames[0] for plan in plans(paper, "overload")]
+    assert all(300 <= presses[0].pressure_kpa <= 600 for presses in beyond)
     for plan in plans(paper, "jump"):
         before, after = set(plan.frames[-2]), set(plan.frames[-1])
         assert len(before - after) == len(after - before) == 1
@@ -100,25 +91,6 @@ def test_a_palm_comes_from_nothing_to_its_pressure(paper: SensorDescription) -> 
     assert {press.shape for press in last} == {"ellipse", "rectangle"}
     assert {press.profile for press in last} == {"flat", "dome"}
     assert max(press.radius_m for press in last) > 0.050
-
-
-def test_presses_overload_the_table_with_others_in_range(paper: SensorDescription) -> None:
-    scenes = [plan.frames[0] for plan in plans(paper, "overload")]
-    assert {len(presses) for presses in scenes} == {1, 2, 3}
-    assert all(300 <= presses[0].pressure_kpa <= 600 for presses in scenes)
-    others = [press.pressure_kpa for presses in scenes for press in presses[1:]]
-    assert min(others) <= 200
-    assert max(others) > 300
-
-
-def test_mixed_presses_are_on_skins_made_by_hand(paper: SensorDescription) -> None:
-    for plan in plans(paper, "mixed"):
-        assert (plan.unevenness, plan.impedance_deviation) == (0.10, 0.30)
-        off_mm = 1e3 * np.abs(plan.displaced_m)
-        assert len(off_mm) == 16
-        assert 0.5 < off_mm.max() <= 1
-        assert (plan.snr_db, plan.snr_of) == (60, "voltage")
-        assert (plan.contrast, plan.opposite) == (100, False)  # as described
 
 
 def kind(press: Press) -> tuple[Shape, Profile]:
@@ -196,13 +168,6 @@ def test_states_of_a_sheet(small: SensorDescription) -> None:
     assert 1e-4 < change(loose[Channel.STRUCTURE], made[Channel.STRUCTURE]) < 0.2
 
 
-def test_exchanging_leads_twice_is_nothing() -> None:
-    rng = np.random.default_rng(0)
-    resistance = np.pad(rng.standard_normal((4, 4)), (0, 1))
-    order = [3, 1, 2, 0, 4]
-    np.testing.assert_allclose(exchanged(exchanged(resistance, order), order), resistance)
-
-
 def test_a_skin_may_be_warped(small: SensorDescription) -> None:
     """A contact lies where it lies, whatever the sheet beneath it does."""
     off = np.where(np.arange(small.electrode_count) == 1, 0.001, 0.0)
@@ -235,36 +200,30 @@ def _built(
     )
 
 
-def last_of(method: str, case: Case) -> Played:
-    *_, last = Player(case.description).play(case, Variant(method))
+def last_of(case: Case) -> Outcome:
+    *_, last = play([case], "tikhonov")
     return last
 
 
-def score_of(case: Case) -> Score:
-    *_, last = play([case], "tikhonov")
-    return last.score
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["tikhonov", "noser"])
 def test_regularisation_is_so_many_times_what_the_rule_chooses(
-    small: SensorDescription, method: str, monkeypatch: pytest.MonkeyPatch
+    small: SensorDescription, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     case, factor = case_of(small, "ordinary"), 0.01
-    right = last_of(method, case).made.map
+    right = last_of(case).made.map
     instrument = small.instrument.model_copy(update={"regularisation": factor})
     told = case.description.model_copy(update={"instrument": instrument})
-    wrong = last_of(method, replace(case, description=told)).made.map
+    made = last_of(replace(case, description=told)).made.map
     monkeypatch.setattr(
         "tactomo_models.methods.linear.prior_weight",
         lambda *given: factor * linear.prior_weight(*given),
     )
-    expected = last_of(method, case).made.map
-    assert wrong is not None
+    expected = last_of(case).made.map
+    assert made is not None
     assert right is not None
     assert expected is not None
     top = float(expected.max())
-    np.testing.assert_allclose(wrong, expected, atol=1e-3 * top)
+    np.testing.assert_allclose(made, expected, atol=1e-3 * top)
     assert np.abs(right - expected).max() > 0.1 * top
 
 
@@ -288,18 +247,19 @@ def test_what_is_right_where_the_magnitude_channel_shows_nothing(small: SensorDe
     """The pressed shape counts; at rest, whether a contact is reported; a lack of a map warns."""
     light = case_of(small, "light")
     assert not light.truth.map.any()
-    shape = last_of("tikhonov", light).made.structure
+    outcome = last_of(light)
+    shape = outcome.made.structure
     assert shape is not None
     expected = np.corrcoef(shape.ravel(), light.truth.pressed.ravel())[0, 1]
-    assert score_of(light).likeness == pytest.approx(expected)
+    assert outcome.score.likeness == pytest.approx(expected)
     drifted = case_of(small, "drift-at-rest")
-    ghosts = score_of(drifted)
+    ghosts = last_of(drifted).score
     assert (ghosts.likeness == 0) is (ghosts.found > 0)
     rest = {name: getattr(drifted.tare, name) for name in BOTH_CHANNELS}
     still = replace(drifted, frames=[replace(drifted.frames[0], scans=rest)])
-    assert score_of(still).likeness == 1
+    assert last_of(still).score.likeness == 1
     ordinary = case_of(small, "ordinary")
-    absent = score_of(replace(ordinary, frames=[replace(ordinary.frames[0], scans={})]))
+    absent = last_of(replace(ordinary, frames=[replace(ordinary.frames[0], scans={})])).score
     assert absent.bad
     assert absent.warned
 

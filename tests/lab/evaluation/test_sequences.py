@@ -113,7 +113,7 @@ def test_scans_tell_the_noise_that_those_at_rest_have_not(changing: Case) -> Non
     """Where nothing tells the noise, two frames of three are distrusted."""
     scores = [outcome.score for outcome in play([changing], "fit")]
     assert len(scores) == len(changing.frames)
-    assert np.mean([score.distrusted for score in scores]) < 0.1
+    assert np.mean([score.warned for score in scores]) < 0.1
 
 
 @pytest.mark.slow

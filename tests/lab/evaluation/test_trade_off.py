@@ -84,7 +84,7 @@ def test_still_scenes_are_measured_under_each_budget(
     assert max(icc[:2]) < icc[2]
     # A millisecond of work is about what a linear image takes.
     assert max(seconds[:2]) < seconds[2] <= patient.summary.seconds_99
-    assert hasty.summary.distrusted == 1
+    assert hasty.summary.warned == 1
 
 
 def test_methods_whose_network_nobody_trained_are_left_out(small: SensorDescription) -> None:
