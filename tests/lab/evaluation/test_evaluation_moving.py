@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import combinations, pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from tactomo_lab.evaluation.moving import (
     INDENTERS,
     Step,
     choreography,
-    draw_sequence,
     follow,
 )
 from tactomo_lab.evaluation.play import play
@@ -153,23 +151,3 @@ def test_a_tare_forgets_who_was_who(paper: SensorDescription, simulator: SkinSim
     held = Step("hold", {"A": press("A")})
     scores = played(sequence(paper, simulator, held, held, replace(held, tare=True)))
     assert [score.switches for score in scores] == [0, 0, 1]
-
-
-@pytest.mark.long
-def test_a_sequence_is_drawn_once_and_kept(
-    small: SensorDescription, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("CACHE_DIRECTORY", str(tmp_path))
-    first, again = (draw_sequence(small, "tuning", 0) for _ in range(2))
-    assert len(list((tmp_path / "scenes").iterdir())) == 1
-    name = Channel.STRUCTURE
-    for one, other in zip(first.frames, again.frames, strict=True):
-        assert one.presses == other.presses
-        if name in one.scans:
-            np.testing.assert_array_equal(one.scans[name], other.scans[name])
-    at_rest = [frame.scans[name] for frame in first.frames[:4]]
-    loaded = [f.scans[name] for f in first.frames if f.presses and name in f.scans]
-    rest = first.tare.structure
-    assert rest is not None
-    std = 0.01 * np.sqrt(np.mean((np.array(loaded) - rest) ** 2))
-    assert np.std(np.array(at_rest) - rest) == pytest.approx(std, rel=0.15)

@@ -29,7 +29,6 @@ from tactomo_lab.scenes.simulation import (
 from tactomo_lab.scenes.still_scenes import draw_still
 from tactomo_models import DataError, Press, SensorDescription
 from tactomo_models.arrays import FloatArray
-from tactomo_models.physics.bare_sheet import transfer_resistances
 from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
 from tactomo_protocol import Channel
 from variants import variant
@@ -63,17 +62,6 @@ def test_a_layout_keeps_its_promises(paper: SensorDescription, contacts: int, nu
         assert PRESSURE_KPA[0] <= press.pressure_kpa <= PRESSURE_KPA[1]
         assert press.shape == layout.shape or layout.shape == "mixed"
     assert all(gap_m(a, b) >= GAP_M for a, b in combinations(layout.frames[0], 2))
-
-
-def test_layouts_are_all_that_was_asked_for(paper: SensorDescription) -> None:
-    drawn = [draw_still(paper, "tuning", contacts, n) for contacts in (1, 3) for n in range(60)]
-    assert {layout.shape for layout in drawn} == {*SHAPES, "mixed"}
-    assert {layout.opposite for layout in drawn} == {True, False}
-    contrasts = [layout.contrast for layout in drawn]
-    assert min(contrasts) < 15
-    assert max(contrasts) > 70
-    reach = max(np.abs(outline_of(press)).max() for layout in drawn for press in layout.frames[0])
-    assert reach > 0.066  # of a sensing area that ends at 0.069
 
 
 def test_no_scene_is_in_both_seed_sets(paper: SensorDescription) -> None:
@@ -144,18 +132,6 @@ def test_variants_of_a_sensor(paper: SensorDescription, small: SensorDescription
     assert channel.saturated_ratio == pytest.approx(1 / 20)
 
 
-def test_transfer_resistances_of_an_uneven_sheet(small: SensorDescription) -> None:
-    """Symmetric, and inversely proportional to conductivity and impedance together."""
-    sheet = mesh_sheet(small, refinements=1)
-    rng = np.random.default_rng(0)
-    uneven = np.exp(rng.standard_normal(sheet.mesh.t.shape[1]))
-    impedance = np.exp(rng.standard_normal(small.electrode_count))
-    transfer = transfer_resistances(small, sheet, uneven, impedance)
-    np.testing.assert_allclose(transfer, transfer.T, rtol=1e-8)
-    halved = transfer_resistances(small, sheet, 2 * uneven, impedance / 2)
-    np.testing.assert_allclose(halved, transfer / 2, rtol=1e-8)
-
-
 @pytest.mark.slow
 def test_the_simulation_converges(paper: SensorDescription) -> None:
     """Voltage changes are right to about a percent: a mesh with other nodes says the same."""
@@ -223,14 +199,6 @@ def test_the_same_scene_comes_out_of_the_cache(
     mended = one(paper)
     for scene in (again, mended):
         np.testing.assert_array_equal(scan_of(scene), scan_of(first))
-
-
-def test_what_the_cache_cannot_keep_is_simulated(
-    paper: SensorDescription, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    kept = one(paper)
-    monkeypatch.setenv("CACHE_DIRECTORY", "/proc/nowhere")
-    np.testing.assert_array_equal(scan_of(one(paper)), scan_of(kept))
 
 
 def test_more_contacts_than_there_is_room_for(small: SensorDescription) -> None:

@@ -99,15 +99,6 @@ def test_a_level_set_knows_one_kind_and_is_refused(tank: SensorDescription) -> N
         Reconstructor(tank, method="levelset")
 
 
-def test_turned_over_the_kinds_change_places(imager: TankImager, drawn: Tanks) -> None:
-    """A linear image of the opposite change is the opposite image."""
-    image = imager.reconstruct(drawn.changes[0], "noser").structure
-    opposite = imager.reconstruct(-drawn.changes[0], "noser").structure
-    assert image is not None
-    assert opposite is not None
-    np.testing.assert_allclose(opposite, -image, atol=1e-4)
-
-
 def test_a_file_of_scans_of_such_a_tank(
     tank: SensorDescription,
     tank_artifact: Artifact,
@@ -175,15 +166,6 @@ def test_what_is_expected_of_a_certain_image() -> None:
     certain[0] = 1 - certain[1] - certain[2]
     assert expected_correlation(certain) == pytest.approx(1)
     assert expected_correlation(0.5 * certain + 0.5 * certain[[1, 0, 2]]) < 0.75
-
-
-@pytest.mark.slow
-def test_seeds_say_which_tank(tank: SensorDescription, drawn: Tanks) -> None:
-    number = int(drawn.names[0].split()[1])
-    again = simulated_tanks(tank, "tuning", number + 1)
-    np.testing.assert_array_equal(again.truth[number], drawn.truth[0])
-    other = simulated_tanks(tank, "reporting", 1)
-    assert not np.array_equal(other.truth[0], again.truth[0])
 
 
 def test_what_is_no_set_of_tanks(tank: SensorDescription, tmp_path: Path) -> None:
