@@ -25,7 +25,6 @@ from fake_control import FakeControl
 from tactomo_client import ClientError, Contact, ControlError
 from tactomo_client.fake import FakeSensor
 from tactomo_viewer import ViewerError
-from viewer_process import viewer_process
 
 CONTACT = Contact(2, 12.0, -30.0, 707.0, 0.18, 0.01, None)
 RAMP = np.tile(np.linspace(0, 1, 51, dtype=np.float32), (51, 1))
@@ -418,6 +417,23 @@ async def test_the_page_brings_everything_itself(sensor: FakeSensor) -> None:
 
 
 # Starting and stopping
+
+
+PROGRAM = """
+import json, sys, tactomo_viewer
+tactomo_viewer.Viewer("left", **json.loads(sys.argv[1])).serve(0)
+"""
+
+
+def viewer_process(stderr: int | None = None, **addresses: str) -> subprocess.Popen[str]:
+    """Start the viewer of `left` in a process; its first line on stdout has its URL."""
+    arguments = json.dumps(addresses)
+    return subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, arguments],
+        stdout=subprocess.PIPE,
+        stderr=stderr,
+        text=True,
+    )
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

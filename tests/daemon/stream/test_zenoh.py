@@ -23,7 +23,6 @@ import pytest
 import zenoh
 import zmq
 from hostile_page import SUBSCRIBE, post
-from logged_process import LoggedProcess, next_of
 from needs import need
 from page import Page
 from tactomo.stream import zenoh_bridge
@@ -37,8 +36,38 @@ from whole_system import SENSOR, running_demo
 ZENOH = ("-m", "tactomo.cli", "zenoh", "--log-format", "json")
 EXAMPLES = Path(__file__).parents[3] / "deploy/examples"
 Configure = Callable[..., Path]
-Start = Callable[..., LoggedProcess]
 TOUCH = [Contact(1, 10.0, 0.0, 700.0, 0.1, 0.01, 170.0)]
+
+
+class LoggedProcess:
+    """Python with some arguments, which logs JSON; it is ready, at `address`."""
+
+    def __init__(self, *arguments: object) -> None:
+        command = [sys.executable, *map(str, arguments)]
+        self.process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        self.address: str = self.said("ready")["stream"]
+
+    def said(self, event: str) -> dict[str, Any]:
+        """Return the next such line of its log."""
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            entry: dict[str, Any] = json.loads(line)
+            if entry["event"] == event:
+                return entry
+        raise AssertionError(f"it ended with status {self.process.wait()}")
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.communicate()
+
+
+def next_of(socket: zmq.Socket[bytes], send: Callable[[], object]) -> Any:
+    """Return the next message; `send` is called until it comes."""
+    wait_until(lambda: socket.poll(20), "a message", meanwhile=send, step_s=0.0)
+    return decode_message(socket.recv())
+
+
+Start = Callable[..., LoggedProcess]
 
 
 @pytest.fixture
