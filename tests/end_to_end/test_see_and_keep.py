@@ -1,4 +1,4 @@
-"""The path from nothing to a picture: the commands of docs/see_and_keep.md, as they stand there."""
+"""What docs/see_and_keep.md does with a recording: its commands, as they stand there."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from foxglove_client import FoxgloveClient
 from newcomer import Newcomer
 from page import Page
 from recorded_grasp import LAST_PRESSED, contacts_of, write_grasp
@@ -35,23 +34,6 @@ def test_what_is_done_with_a_recording(newcomer: Newcomer) -> None:
     write_grasp(newcomer.folder / "grasp.mcap")
     newcomer.follow(PAGE.commands()[4:])
     assert force_n(newcomer) == pytest.approx(contacts_of(LAST_PRESSED - 1)[0].force_n, abs=1)
-
-
-@pytest.mark.long
-@pytest.mark.timeout(400)
-def test_the_whole_path(newcomer: Newcomer) -> None:
-    install, demo, foxglove, record, plot, *exports = PAGE.commands()
-    assert install.startswith("pip install ")
-    newcomer.follow([demo, foxglove])
-    with FoxgloveClient(newcomer.addresses["url"]) as client:
-        newcomer.run(record)
-        client.wait("/skin/contacts", lambda scene: scene.entities)
-        client.wait("/skin/sheet")
-    assert "/skin/grid" in (newcomer.folder / "skin.json").read_text()
-    assert "wrote grasp.png" in newcomer.run(plot)
-    to_foxglove, _ = newcomer.follow(exports)
-    assert "frames for Foxglove" in to_foxglove
-    assert 20 < force_n(newcomer) < 300
 
 
 def test_every_column_and_field_is_on_the_page() -> None:
