@@ -13,7 +13,7 @@ ModelError
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -43,6 +43,10 @@ class MethodError(ModelError):
     """A reconstruction method that there is not, or that the sensor cannot do."""
 
 
+_NO_KEYS: Final = ("one", "two", "[key]")  # of a place: what a list's length or a name adds
+_METRES: Final = re.compile(r"(?<!_s)(?<!_ohm)_m(\.\d+)*$")
+
+
 @contextmanager
 def os_errors_as(kind: type[ModelError], what: str, next_step: str) -> Iterator[None]:
     """Raise an OSError as one of these; `what` failed, such as "cannot write FILE"."""
@@ -64,33 +68,52 @@ def explain_all(items: Iterable["ErrorDetails"]) -> list[str]:
     ]
 
 
+# What is allowed, by pydantic's kind of error, where pydantic's own words are for programmers.
+_ALLOWED: Final = {
+    "dict_type": "give a table of keys",
+    "model_type": "give a table of keys",
+    "tuple_type": "give a list, in brackets",
+    "too_short": "give at least {min_length} entries",
+    "too_long": "give at most {max_length} entries",
+    "string_too_long": "give at most {max_length} characters",
+    "string_type": "give a text, in quotes",
+    "bool_type": "give true or false",
+    "float_type": "give a number",
+    "int_type": "give an integer",
+    "int_parsing_size": "give a smaller integer",
+    "finite_number": "give a finite number",
+}
+
+
 def explain(item: "ErrorDetails") -> str:
     """Turn one of pydantic's complaints about a file into "key = value: what is allowed"."""
-    key = _short(
-        ".".join(str(part) for part in item["loc"] if part not in ("one", "two"))
-    )  # no keys
-    given = _short(repr(item["input"]))
-    message = item["msg"].removeprefix("Value error, ")
-    if item["type"] == "extra_forbidden":
+    kind, value, limits = item["type"], item["input"], item.get("ctx", {})
+    key = _short(".".join(str(part) for part in item["loc"] if part not in _NO_KEYS))
+    if kind == "extra_forbidden":
         return f"unknown key {key}"
-    if item["type"] == "tuple_type":
-        return f"{key} = {given}: give a list, in brackets"
-    if item["type"] == "finite_number":
-        return f"{key} = {given}: give a finite number"
-    if item["type"] == "missing":
+    if kind == "missing":
         return f"{key} is missing"
+    is_beyond = kind.startswith(("less_than", "greater_than"))
+    message = (
+        _ALLOWED[kind].format(**limits)
+        if kind in _ALLOWED
+        else item["msg"]
+        .removeprefix("Value error, ")
+        .replace("Input should be", "give a number" if is_beyond else "give")
+    )
     if not key:
         return message
-    if isinstance(item["input"], dict):  # from a section's own check: its text opens with the key
+    if kind == "value_error" and isinstance(value, dict):  # a section's check: opens with the key
         return f"{key}.{message}"
-    is_beyond = item["type"].startswith(("less_than", "greater_than"))
-    if re.search(r"_m(\.\d+)*$", key) and is_beyond:  # in metres
-        value = item["input"]
+    if item["loc"][-1] == "[key]":  # the name of a table
+        return f"{key}: {message}"
+    # A length beyond a limit of its own sign is in another unit.
+    if is_beyond and _METRES.search(key) and value * next(iter(limits.values())) > 0:
         if abs(value) > 1:
             message += f"; in millimetres? {value:g} mm are {value * 1e-3:g} m"
-        elif value > 0:
+        else:
             message += f"; lengths are metres: {value * 1e6:g} mm are {value * 1e3:g} m"
-    return f"{key} = {given}: {message}"
+    return f"{key} = {_short(repr(value))}: {message}"
 
 
 def _short(text: str) -> str:

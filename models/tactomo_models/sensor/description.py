@@ -20,7 +20,7 @@ from tactomo_models.sensor.mount import Mount
 from tactomo_models.sensor.outline import Pad, RimElectrode
 from tactomo_models.sensor.pattern import Pairs, combined, ring_pairs
 from tactomo_models.sensor.response import MagnitudeChannel, StructureChannel
-from tactomo_models.sensor.section import Section
+from tactomo_models.sensor.section import Name, Section, spelt
 from tactomo_models.sensor.sheet import Electrodes, Sheet, check_electrodes, placed_electrodes
 
 Electrode = Annotated[int, Field(ge=0, le=63)]
@@ -28,8 +28,6 @@ PairList = Annotated[
     tuple[Annotated[tuple[Electrode, Electrode], Field(strict=False)], ...],
     Field(min_length=1, max_length=256, strict=False),
 ]
-
-CompanionName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,62}$")]
 
 MAX_TABLE_BYTES = 2_000_000_000
 """Of a sensor's influence tables, which grow as the square of the map's nodes."""
@@ -94,7 +92,7 @@ class Instrument(Section):
     volts_per_unit: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     regularisation: Annotated[float, Field(ge=1e-3, le=1e6)] = 1.0
     stability: Annotated[float, Field(ge=0, le=0.1)] = 0.003
-    start: Annotated[str, Field(max_length=16, pattern=r"^[ -~\r\n]*$")] = ""
+    start: Annotated[str, Field(max_length=16), spelt(r"[ -~\r\n]*", "give ASCII characters")] = ""
     scan_rate_hz: Annotated[float, Field(ge=0.1, le=1000)] = 20.0
     frequency_hz: Annotated[float, Field(ge=100, le=1e7)] = 10_000.0
 
@@ -119,7 +117,7 @@ class SensorDescription(Section):
     """A whole sensor: sheet, electrodes, pattern, map and the channels' contact response."""
 
     schema_version: Literal[1] = Field(alias="schema")
-    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,62}$")]
+    name: Name
     title: str = ""
     sheet: Sheet
     electrodes: Electrodes
@@ -129,7 +127,7 @@ class SensorDescription(Section):
     magnitude: MagnitudeChannel | None = None
     structure: StructureChannel | None = None
     mount: Mount | None = None
-    companion: Annotated[dict[CompanionName, Companion], Field(max_length=16, default_factory=dict)]
+    companion: Annotated[dict[Name, Companion], Field(max_length=16, default_factory=dict)]
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Self:

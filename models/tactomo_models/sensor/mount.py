@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from tactomo_models.arrays import FloatArray
-from tactomo_models.sensor.section import Section
+from tactomo_models.sensor.section import Section, spelt
 from tactomo_models.sensor.sheet import Metres
 from tactomo_models.sensor.wavefront import Triangles, read_obj
 
@@ -236,7 +236,14 @@ class SurfaceMount(Section):
 class Mount(Section):
     """The link that carries the sheet, and where: on a plane, a cylinder or a surface."""
 
-    frame: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_./-]{0,62}$")]
+    frame: Annotated[
+        str,
+        spelt(
+            "[A-Za-z0-9_][A-Za-z0-9_./-]{0,62}",
+            "give a name of letters, digits and _ . / -, none of the last three first, 63 "
+            "characters at most",
+        ),
+    ]
     plane: PlaneMount | None = None
     cylinder: CylinderMount | None = None
     surface: SurfaceMount | None = None

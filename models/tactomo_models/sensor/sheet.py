@@ -62,7 +62,7 @@ class Sheet(Section):
     @field_validator("width_m")
     @classmethod
     def _width_is_there(cls, width_m: float | None, given: ValidationInfo) -> float | None:
-        if width_m is None and given.data.get("shape") != "polygon":
+        if width_m is None and given.data.get("shape") in ("rectangle", "disc"):
             raise PydanticCustomError("missing", "Field required")
         return width_m
 
@@ -70,7 +70,9 @@ class Sheet(Section):
     def _shape_has_its_size(self) -> Self:
         is_polygon = self.shape == "polygon"
         if is_polygon != (self.outline_m is not None) or (self.holes_m and not is_polygon):
-            raise ValueError("a polygon takes outline_m and holes_m, and no other shape does")
+            raise ValueError(
+                "outline_m: a polygon takes outline_m and holes_m, and no other shape does"
+            )
         if is_polygon and (self.width_m or self.height_m):
             raise ValueError("width_m, height_m: must be left out, outline_m is the size")
         if self.shape == "rectangle" and self.height_m is None:
@@ -93,13 +95,13 @@ class Sheet(Section):
         keys = "outline_m, holes_m and positions_m" if self.outline_m else "width_m and height_m"
         if min(wide, high) < MIN_SHEET_M:
             raise ValueError(
-                f"the sheet is {1e3 * wide:.4g} x {1e3 * high:.4g} mm; if this should be "
-                f"{1e6 * wide:.4g} x {1e6 * high:.4g} mm, multiply {keys} by 1000"
+                f"{keys}: the sheet is {1e3 * wide:.4g} x {1e3 * high:.4g} mm; if this should be "
+                f"{1e6 * wide:.4g} x {1e6 * high:.4g} mm, multiply them by 1000"
             )
         if max(wide, high) > MAX_SHEET_M:
             raise ValueError(
-                f"the sheet is {wide:.4g} x {high:.4g} m, and may be {MAX_SHEET_M:g} m: in "
-                f"centimetres or millimetres? divide {keys} by 100 or 1000"
+                f"{keys}: the sheet is {wide:.4g} x {high:.4g} m, and may be {MAX_SHEET_M:g} m: in "
+                f"centimetres or millimetres? divide them by 100 or 1000"
             )
 
     @cached_property

@@ -45,6 +45,7 @@ def structure_table(ratios: str) -> str:
             ("width_m = 0.06", "width_m = -1"),
             ["sheet.width_m", "-1", "greater than or equal to 0.00001"],
         ),
+        (("conductivity_s_m = 1.0", "conductivity_s_m = -2.0"), ["= -2.0: give a number greater"]),
         (("width_m = 0.06", "width_m = 120"), ["in millimetres? 120 mm are 0.12 m"]),
         (("width_m = 0.06", 'width_m = "0.06"'), ["sheet.width_m", "'0.06'", "number"]),
         (("per_side = 2", "per_side = 2.5"), ["electrodes.per_side = 2.5", "integer"]),

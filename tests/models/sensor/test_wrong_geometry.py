@@ -42,12 +42,21 @@ def with_tables(tables: str) -> str:
         (shipped_text("palm_l").replace("= 0.006", "= 6e-6"), "", "6 mm are 0.006 m"),
         (shipped_text("palm_l").replace("= 0.006", "= 6.0"), "", "give a shorter one, in metres"),
         (outlined(CORNERS, f"[{CORNERS.replace('0.06', '0.1')}]"), "", "covers the whole sheet"),
+        (outlined("[[0, 0], [1, 1]]"), "", "outline_m = [[0, 0], [1, 1]]: give at least 3 entries"),
         (with_tables(PLANE + "[0, 0, 120]"), "", "in millimetres? 120 mm are 0.12 m"),
         (
             with_tables(SURFACE),
             (SQUARE + TEXTURE).format(0.00006) + FACE,
             "multiply them (vt) by 1000",
         ),
+        (with_tables(CELL.replace("0.1", "0") + CORNERS), "", "noise_n = 0: give a number greater"),
+        (
+            with_tables(CELL.replace("cell", '"Cell 1"') + CORNERS),
+            "",
+            "Cell 1: give a name of lower",
+        ),
+        (with_tables("[mount]\nframe = ''"), "", "mount.frame = '': give a name of letters"),
+        (with_tables("[mount]\nplane = 1"), "", "mount.plane = 1: give a table of keys"),
         (with_tables(f"{CELL}[[0.02, 0.02], [0.05, 0.02], [0.05, 0.05]]"), "", "off the sheet"),
         (
             with_tables(f"{CELL}[[-0.05, -0.05], [-0.01, -0.01], [-0.01, -0.05], [-0.05, -0.01]]"),
