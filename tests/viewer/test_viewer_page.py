@@ -813,6 +813,28 @@ def test_an_outage_is_told_and_each_event_stands_where_it_happened(page: Page) -
     assert [words for words in readouts(page) if "no data · port" in words]
 
 
+def test_the_wait_of_a_paused_replay_is_no_outage(page: Page) -> None:
+    page.skin.status |= {"source": {"kind": "replay"}, "replay": REPLAY}
+    page.open()
+    wait_until(lambda: page.js("return tactomo.timeline.frames.length") > 5)
+    page.skin.status |= {"state": "paused", "replay": REPLAY | {"paused": True}}
+    page.skin.sends_frames = False
+    wait_until(lambda: page.health == "replay-paused")
+    time.sleep(1.5)
+    page["pause"].click()
+    wait_until(lambda: page.banner.startswith("Looking back. The map shows the frame of"))
+    assert "stale" not in page.map_classes
+    middle = page.js("return tactomo.timeline.pausedAt - 700")
+    page["pause"].click()
+    page.skin.status |= {"state": "running", "replay": REPLAY}
+    page.skin.sends_frames = True
+    wait_until(lambda: page.health == "good")
+    page.js("tactomo.timeline.lookAt(arguments[0])", middle)
+    wait_until(lambda: page.banner.startswith("Looking back. The map shows the frame of"))
+    assert "stale" not in page.map_classes
+    assert "no data" not in page.js("return tactomo.timeline.readout")
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("quiet_console")
 def test_what_was_is_looked_at_and_left_again(page: Page) -> None:

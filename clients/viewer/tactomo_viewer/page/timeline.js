@@ -17,7 +17,7 @@ export class Timeline {
   /** `onLook()` is called when another moment is to be shown. Times are in ms, of performance.now(). */
   constructor({ canvas, slider, onLook }) {
     Object.assign(this, { canvas, slider, onLook });
-    this.frames = [];      // {at, frame}, oldest first
+    this.frames = [];      // {at, frame, stood}, oldest first; `stood`: a replay waited at this one
     this.events = [];      // {at, name, severity}
     this.pausedAt = null;  // the newest moment while it stands still
     this.spanMs = KEPT_MS;
@@ -49,6 +49,12 @@ export class Timeline {
     const isKept = (item) => item.at > at - KEPT_MS || this.#isBeforePause(item.at);
     if (!isKept(this.frames[0])) this.frames = this.frames.filter(isKept);
     this.events = this.events.filter(isKept);
+  }
+
+  /** Take it that a replay stands at the newest frame: the time until the next one is no outage. */
+  stand() {
+    const newest = this.frames.at(-1);
+    if (newest) newest.stood = true;
   }
 
   /** Take an event that happened at `at`. */
@@ -92,7 +98,7 @@ export class Timeline {
    */
   get shown() {
     const found = this.isPaused && (this.#frameAt(this.#moment) ?? this.frames[0]);
-    return found ? { ...found, isKnown: this.#moment - found.at <= this.options.gapMs } : null;
+    return found ? { ...found, isKnown: !this.#isOutage(found, this.#moment) } : null;
   }
 
   /** What was at the pointer, or at the moment looked at, in words; nothing where there is neither. */
@@ -100,8 +106,8 @@ export class Timeline {
     if ((this.pointer === null && !this.isPaused) || !this.options) return "";
     const at = this.pointer === null ? this.#moment : this.#time(this.pointer);
     const found = this.#frameAt(at);
-    const { unit, gapMs } = this.options;
-    const contacts = !found || at - found.at > gapMs ? ["no data"]
+    const { unit } = this.options;
+    const contacts = !found || this.#isOutage(found, at) ? ["no data"]
       : found.frame.contacts.map((contact) => {
         const force = quantityText(forceOf(contact), 0);
         return `${contact.id}: ${pressureText(contact, unit)}${force ? `, ${force} N` : ""}`;
@@ -153,6 +159,11 @@ export class Timeline {
 
   get #moment() {
     return this.isPaused ? this.pausedAt + Number(this.slider.value) : this.end;
+  }
+
+  // Whether frames were missing between a frame and a moment before the next one.
+  #isOutage({ at, stood }, moment) {
+    return !stood && moment - at > this.options.gapMs;
   }
 
   #frameAt(moment) {
@@ -230,16 +241,17 @@ export class Timeline {
 
   // Times without frames, with how long they were, and those of which no contacts say nothing.
   #outages(c, frames) {
-    const { gapMs } = this.options;
     const ends = [...frames.slice(1).map(({ at }) => at), this.end];
-    frames.forEach(({ at, frame }, i) => {
-      const isGap = ends[i] - at > gapMs;
-      if (!isGap && areTouchesSeen(frame)) return;
+    frames.forEach((item, i) => {
+      const { at, frame, stood } = item;
+      const isOutage = this.#isOutage(item, ends[i]);
       const [x0, x1] = [this.#x(at), this.#x(ends[i])];
-      c.fillStyle = this.#hatch(isGap ? this.theme.axis : this.theme.warn);
-      c.fillRect(x0, 0, x1 - x0, this.lanes.bottom);
-      const text = `no data for ${seconds(ends[i] - at)}`;
-      if (!isGap || c.measureText(text).width + 8 > x1 - x0) return;
+      if (isOutage || !areTouchesSeen(frame)) {
+        c.fillStyle = this.#hatch(isOutage ? this.theme.axis : this.theme.warn);
+        c.fillRect(x0, 0, x1 - x0, this.lanes.bottom);
+      }
+      const text = `${stood ? "replay waited" : "no data"} for ${seconds(ends[i] - at)}`;
+      if (ends[i] - at <= this.options.gapMs || c.measureText(text).width + 8 > x1 - x0) return;
       const [x, y, room] = [(x0 + x1) / 2, this.lanes.height / 2, c.measureText(text).width + 8];
       c.fillStyle = this.theme.background;
       c.fillRect(x - room / 2, y - 8, room, 16);

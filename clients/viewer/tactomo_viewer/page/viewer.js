@@ -293,6 +293,7 @@ function refresh() {
   const isPaused = timeline.isPaused;
   setText(byId("pause"), isPaused ? "Back to now" : "Pause");
   const stands = ["ended", "replay-paused"].includes(live?.name) && state.frame;
+  if (stands) timeline.stand();
   timeline.draw({
     end: stands ? state.frame.receivedAt : now,
     unit: chosen("unit"),
