@@ -1,9 +1,9 @@
 """Binding our sockets: only where it is safe, with an error that says what to do otherwise.
 
 Without keys an address must be one that no other computer can reach. An ``ipc://`` file may be
-connected to by its owner and group alone; what a killed daemon left of it is replaced. With keys
-(`tactomo.stream.access_control`) every ``tcp://`` address is encrypted and lets in the allowed
-clients only.
+connected to by its owner and group alone; it goes when its program ends, and what a killed one left
+is replaced. With keys (`tactomo.stream.access_control`) every ``tcp://`` address is encrypted and
+lets in the allowed clients only.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import socket as posix_socket
 import stat
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
@@ -164,6 +164,17 @@ def rebind(socket: zmq.Socket[bytes], address: str) -> None:
             time.sleep(0.001)
         else:
             return
+
+
+def remove_file(endpoint: str) -> None:
+    """Remove the file of a bound ``ipc://`` endpoint, which ZeroMQ leaves behind.
+
+    To be called before the socket closes: afterwards the path may be another's.
+    """
+    path = Path(endpoint.removeprefix(IPC))
+    with suppress(OSError):
+        if endpoint.startswith(IPC) and path.is_socket():
+            path.unlink()
 
 
 def needs_keys(endpoint: str) -> AddressError:

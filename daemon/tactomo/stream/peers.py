@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 import zmq
 from zmq.utils.monitor import parse_monitor_message
 
-from tactomo.endpoint import bind
+from tactomo.endpoint import bind, remove_file
 from tactomo.errors import AddressError
 from tactomo.events import OnEvent
 
@@ -104,7 +104,8 @@ class Peers:
                 self._cut(descriptor, received - read_bytes)
 
     def close(self) -> None:
-        """Watch no more; before the socket is closed."""
+        """Watch no more, and remove the file of an ``ipc://`` address; before the socket closes."""
+        remove_file(self.address)
         self._socket.disable_monitor()
         self.monitor.close(0)
 

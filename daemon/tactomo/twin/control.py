@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field
 from tactomo_client.errors import MessageError
 from tactomo_client.messages import MAX_MESSAGE_BYTES, decode_request, encode_error, encode_reply
 
-from tactomo.endpoint import bind
+from tactomo.endpoint import bind, remove_file
 from tactomo.errors import AddressError, CommandError
 from tactomo.stream.commands import Arguments, Nothing, obey
 from tactomo.twin.scene import Indenter, Scene, SkinDriftSettings
@@ -119,6 +119,7 @@ class ControlSocket:
 
     def close(self) -> None:
         """Unbind."""
+        remove_file(self.address)
         self._socket.close()
 
     def _reply(self, data: bytes) -> bytes:

@@ -158,18 +158,19 @@ def test_a_demo_leaves_no_process_behind(start: Run) -> None:
 
 
 @linux
-def test_a_demo_in_the_background_of_a_script_ends_by_sigint() -> None:
+def test_a_demo_in_the_background_of_a_script_ends_by_sigint(tmp_path: Path) -> None:
     # A shell has SIGINT ignored for what it starts with `&` where there is no job control.
-    where = "--viewer-port 0 --stream ipc://$D/s --control ipc://$D/c --twin-control ipc://$D/t"
-    script = f'D=$(mktemp -d); "$0" -m tactomo.cli demo {where} & echo $!; wait'
+    where = "--viewer-port 0 --stream ipc://$1/s --control ipc://$1/c --twin-control ipc://$1/t"
+    script = f'"$0" -m tactomo.cli demo {where} & echo $!; wait'
     with subprocess.Popen(
-        ["sh", "-c", script, sys.executable], stdout=subprocess.PIPE, text=True
+        ["sh", "-c", script, sys.executable, tmp_path], stdout=subprocess.PIPE, text=True
     ) as shell:
         assert shell.stdout is not None
         demo = int(shell.stdout.readline())
-        wait_until(lambda: children_of(demo))
+        wait_until(lambda: {path.name for path in tmp_path.iterdir()} == {"s", "c", "t"})
         os.kill(demo, signal.SIGINT)
         wait_until(lambda: not is_running(demo))
+        wait_until(lambda: not list(tmp_path.iterdir()))
 
 
 @pytest.mark.slow

@@ -457,6 +457,7 @@ def test_a_stale_ipc_file_is_replaced_and_a_file_of_yours_is_not(tmp_path: Path)
         assert bind(fresh, f"ipc://{stale}", "control")
         with pytest.raises(AddressError, match="in use"):
             bind(context.socket(zmq.REP), f"ipc://{stale}", "control")
+        assert stale.is_socket()
     yours = tmp_path / "thesis.tex"
     yours.write_text("years of work")
     with context, pytest.raises(AddressError, match="is no socket"):
