@@ -242,9 +242,26 @@ static int condense(const Sheet *s, const Areas *a, int mixes, const double *cha
   return 0;
 }
 
+/* Place of an entry of a symmetric matrix in its lower triangle, row by row. */
+static int64_t in_triangle(int64_t row, int64_t column) {
+  int64_t more = row > column ? row : column;
+  return more * (more + 1) / 2 + row + column - more;
+}
+
 static double green_at(const Sheet *s, int64_t row, int64_t column) {
-  int64_t more = row > column ? row : column, place = more * (more + 1) / 2 + row + column - more;
+  int64_t place = in_triangle(row, column);
   return s->green_single ? s->green_single[place] : s->green_double[place];
+}
+
+/* Columns (size, count) of a symmetric matrix whose lower triangle is given in either precision;
+ * row by row, so that every part of it is read once. */
+void columns_of(const float *singles, const double *doubles, int64_t size, int64_t count,
+                const int64_t *column, double *found) {
+  for (int64_t i = 0; i < size; i++)
+    for (int64_t k = 0; k < count; k++) {
+      int64_t place = in_triangle(i, column[k]);
+      found[i * count + k] = singles ? singles[place] : doubles[place];
+    }
 }
 
 /* Fill in what areas know of the bare sheet: G and u0 at their rims, and their stiffness there.
@@ -665,10 +682,11 @@ typedef struct {
 } Contact;
 
 /* One contact and its hole as they are, and as they are drawn on a graded sheet: smaller, and stronger,
- * for the mesh's blur; how the logarithm of that size goes by that of its own, over 1, and by gamma. */
+ * for the mesh's blur; how the logarithm of that size goes by that of its own, over 1, and by gamma;
+ * the square of how far from its centre it may reach. */
 typedef struct {
   Contact as_is, hole, smaller, smaller_hole;
-  double stronger, by_size, by_edge;
+  double stronger, by_size, by_edge, reach2;
 } Sizes;
 
 /* An outline at a point: t = phi / w, log q, and their derivatives by the form. */
@@ -697,13 +715,17 @@ static Sizes sizes_of(const Field *f, const double *each) {
   double moment = 2 * (each[EDGE] + 2), blur = moment * f->blur_m2 * exp(-2 * each[SIZE]);
   double held = tanh(blur / MOST_BLURRED), left = 1 - MOST_BLURRED * held;
   double size = each[SIZE] + log(left) / 2, by_size = blur * (1 - held * held) / left;
+  double longest = each[SIZE] + hypot(each[E1], each[E2]);
+  for (int h = HARMONIC; h < PEAK; h++) longest += fabs(each[h]);
+  double reach = exp(longest) + 2 * (f->half_width_m + f->offset_m);
   return (Sizes){.as_is = contact_of(each, each[SIZE]),
                     .hole = contact_of(each, each[SIZE] - log(2)),
                     .smaller = contact_of(each, size),
                     .smaller_hole = contact_of(each, size - log(2)),
                     .stronger = 1 / left,
                     .by_size = by_size,
-                    .by_edge = -by_size / moment};
+                    .by_edge = -by_size / moment,
+                    .reach2 = reach * reach};
 }
 
 static Outline outline_at(const Field *f, const Contact *c, double x, double y, int with_slopes) {
@@ -792,6 +814,8 @@ static void press_by(const Field *f, const Contact *c, const Contact *hole, doub
 /* Whether a contact reaches a point, and what it does there. */
 static int press(const Field *f, const Sizes *c, int is_ring, double x, double y,
                  int with_slopes, Press *p) {
+  double dx = x - UNIT_M * c->as_is.each[X], dy = y - UNIT_M * c->as_is.each[Y];
+  if (dx * dx + dy * dy >= c->reach2) return 0;
   p->as_is.outline = outline_at(f, &c->as_is, x, y, with_slopes);
   p->wide = p->as_is.outline.t + f->offset_m / f->half_width_m;
   if (p->wide <= -1) return 0;
@@ -839,30 +863,16 @@ int64_t draw(const Field *f, int64_t count, const double *each, int64_t n, const
              const double *y, int64_t *points, double *enclosed, double *enclosed_kpa,
              double *share, double *pressure) {
   Sizes *contact = malloc(sizeof(Sizes) * (count + 1));
-  double *reach2 = malloc(sizeof(double) * (count + 1));
-  if (!contact || !reach2) {
-    free(contact), free(reach2);
-    return -1;
-  }
-  for (int64_t k = 0; k < count; k++) {
-    const double *c = each + COLUMNS * k;
-    contact[k] = sizes_of(f, c);
-    double longest = c[SIZE] + hypot(c[E1], c[E2]);
-    for (int h = HARMONIC; h < PEAK; h++) longest += fabs(c[h]);
-    double reach = exp(longest) + 2 * (f->half_width_m + f->offset_m);
-    reach2[k] = reach * reach;
-  }
+  if (!contact) return -1;
+  for (int64_t k = 0; k < count; k++) contact[k] = sizes_of(f, each + COLUMNS * k);
   int64_t there = 0;
   for (int64_t i = 0; i < n; i++) {
     double no_wide = 1.0, no_share = 1.0, stronger = 0.0;
     double of_as_is = 0.0, as_is = 0.0, of_drawn = 0.0, drawn = 0.0;
     int hit = 0;
     for (int64_t k = 0; k < count; k++) {
-      const double *c = each + COLUMNS * k;
-      double dx = x[i] - UNIT_M * c[X], dy = y[i] - UNIT_M * c[Y];
       Press p;
-      if (dx * dx + dy * dy >= reach2[k]) continue;
-      if (!press(f, contact + k, c[HOLE] != 0, x[i], y[i], 0, &p)) continue;
+      if (!press(f, contact + k, each[COLUMNS * k + HOLE] != 0, x[i], y[i], 0, &p)) continue;
       hit = 1;
       no_wide *= 1 - (f->is_sharp ? p.as_is.whole : p.enclosed), no_share *= 1 - p.drawn.share;
       double within = (f->is_sharp ? p.as_is.whole : p.enclosed) * p.as_is.left;
@@ -876,7 +886,7 @@ int64_t draw(const Field *f, int64_t count, const double *each, int64_t n, const
     enclosed[there] = 1 - no_wide, enclosed_kpa[there] = as_is / of_as_is;
     share[there] = (1 - no_share) * stronger / of_drawn, pressure[there++] = drawn / of_drawn;
   }
-  free(contact), free(reach2);
+  free(contact);
   return there;
 }
 
@@ -890,12 +900,15 @@ int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, co
                 double *by_enclosed_kpa, double *by_share, double *by_pressure) {
   Sizes *contact = malloc(sizeof(Sizes) * (count + 1));
   Press *pressed = malloc(sizeof(Press) * (count + 1));
-  int64_t *of = malloc(sizeof(int64_t) * (count + 1));
+  int64_t *of = malloc(sizeof(int64_t) * (2 * count + 1)), *is_free = of + count;
   if (!contact || !pressed || !of) {
     free(contact), free(pressed), free(of);
     return -1;
   }
-  for (int64_t k = 0; k < count; k++) contact[k] = sizes_of(f, each + COLUMNS * k);
+  for (int64_t k = 0; k < count; k++) {
+    contact[k] = sizes_of(f, each + COLUMNS * k), is_free[k] = 0;
+    for (int q = 0; q < COLUMNS; q++) is_free[k] |= index[COLUMNS * k + q] >= 0;
+  }
   size_t size = sizeof(double) * n * parameters;
   memset(by_enclosed, 0, size), memset(by_enclosed_kpa, 0, size);
   memset(by_share, 0, size), memset(by_pressure, 0, size);
@@ -906,7 +919,7 @@ int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, co
     for (int64_t k = 0; k < count; k++) {
       int is_ring = each[COLUMNS * k + HOLE] != 0 || index[COLUMNS * k + HOLE] >= 0;
       Press *p = pressed + there;
-      if (!press(f, contact + k, is_ring, x[i], y[i], 1, p)) continue;
+      if (!press(f, contact + k, is_ring, x[i], y[i], is_free[k], p)) continue;
       double within = p->enclosed * p->as_is.left;
       of_as_is += within, as_is += within * p->as_is.pressure;
       of_drawn += p->drawn.share, drawn += p->drawn.share * p->drawn.pressure;
@@ -916,6 +929,7 @@ int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, co
     of_as_is = fmax(of_as_is, 1e-12), as_is /= of_as_is;
     of_drawn = fmax(of_drawn, 1e-12), drawn /= of_drawn, stronger /= of_drawn;
     for (int j = 0; j < there; j++) {
+      if (!is_free[of[j]]) continue;
       const Press *p = pressed + j;
       const Sizes *sizes = contact + of[j];
       const double *c = each + COLUMNS * of[j];

@@ -28,6 +28,7 @@ _ARGUMENTS = {
     "evaluate": [_ARRAY] * 6,
     "evaluate_slopes": [*[_ARRAY] * 5, _COUNT, *[_ARRAY] * 3],
     "differentiate": [_ARRAY, _ARRAY, _COUNT, *[_ARRAY] * 3, _COUNT, *[_ARRAY] * 3],
+    "columns_of": [_ARRAY, _ARRAY, _COUNT, _COUNT, _ARRAY, _ARRAY],
     "conduct": [_ARRAY, _COUNT, _ARRAY, _ARRAY, ctypes.c_double, _ARRAY, _ARRAY],
     "draw": [_ARRAY, _COUNT, _ARRAY, _COUNT, *[_ARRAY] * 7],
     "draw_slopes": [_ARRAY, _COUNT, _ARRAY, _COUNT, *[_ARRAY] * 3, _COUNT, *[_ARRAY] * 4],
@@ -68,7 +69,8 @@ def _functions(path: Path) -> dict[str, Any]:
     library.use_blas(*_routines())
     for name, function in functions.items():
         function.argtypes = _ARGUMENTS[name]
-    functions["draw"].restype, functions["conduct"].restype = _COUNT, None
+    functions["draw"].restype = _COUNT
+    functions["conduct"].restype = functions["columns_of"].restype = None
     return functions
 
 

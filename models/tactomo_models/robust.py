@@ -23,8 +23,8 @@ def huber_sigma(deviations: FloatArray) -> float:
 
     It is their root mean square, sizes cut off at 1.5 of it, so that a third of them may be
     outliers (Huber, "Robust estimation of a location parameter", 1964, proposal 2; 1.5 is his and
-    the usual cut). Less noisy than `robust_sigma`, which it starts from (of an even number, from the
-    upper of the two in the middle).
+    the usual cut). Less noisy than `robust_sigma`, which it starts from (of an even number, from
+    the upper of the two in the middle).
     """
     cut, kept = 1.5, 0.7785  # mean square of unit normal noise cut off there
     rounds = 5  # to 1 % where half as many are outliers

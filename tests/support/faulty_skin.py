@@ -52,7 +52,7 @@ def shorted(simulator: SkinSimulator, first: int, second: int) -> SkinSimulator:
             transfer=bare.transfer - np.outer(electrodes, electrodes) / resistance,
             potentials=bare.potentials - np.outer(nodes, electrodes[:-1]) / resistance,
             green=PackedGreensFunction(
-                (bare.green.rows(np.arange(len(nodes))) - np.outer(nodes, nodes) / resistance)[
+                (bare.green.columns(np.arange(len(nodes))) - np.outer(nodes, nodes) / resistance)[
                     np.tril_indices(len(nodes))
                 ]
             ),

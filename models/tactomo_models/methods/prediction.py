@@ -12,7 +12,7 @@ same step says what is left to gain.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -41,7 +41,7 @@ class Prediction:
     gain: float  # what the last step takes off chi-squared, by the unit of where it was asked
     own: IntArray  # (m,) which were asked about
     family: PressureField = field(repr=False)
-    information: FloatArray = field(repr=False)  # (N + 1, N + 1) inverse covariance
+    information: Callable[[], FloatArray] = field(repr=False)  # (N + 1, N + 1) inverse covariance
 
     @property
     def contacts(self) -> FloatArray:
@@ -52,7 +52,7 @@ class Prediction:
     def sigmas(self) -> FloatArray:
         """(m, COLUMNS) their standard uncertainties; 0 of what is not fitted."""
         sigmas = np.zeros(self.family.free.shape)
-        sigmas[self.family.free] = np.sqrt(np.diag(np.linalg.inv(self.information))[:-1])
+        sigmas[self.family.free] = np.sqrt(np.diag(np.linalg.inv(self.information()))[:-1])
         return np.asarray(sigmas[self.own])
 
 
@@ -204,9 +204,12 @@ def _end(fit: FieldFit, at: _At, frame: Frame, own: IntArray, unit: float) -> Pr
     parameters = at.parameters + step[:-1]
     chi_squared = likelihood.chi_squared(at.residual + J @ step)
     found, _ = laplace(likelihood, family, parameters, J, chi_squared, precision, offset + step)
-    # A peak just above the onset is as uncertain as the sheet tells there, not as before any data.
-    information = likelihood.information(J, chi_squared) + np.diag(precision)
     log_ratio = at.log_ratio + float(step[-1])
+
+    def information() -> FloatArray:
+        """As uncertain as the sheet tells where a peak is just above the onset."""
+        return likelihood.information(J, chi_squared) + np.diag(precision)
+
     return Prediction(found, family.split(parameters), log_ratio, gain, own, family, information)
 
 

@@ -184,7 +184,7 @@ class ForwardModel(CompiledSheet):
         Unlike `jacobian` it looks anywhere, at the price of resolution: it is for finding where a
         contact is missing in a solution, not for fitting it.
         """
-        moved = self.bare.green.rows(solution.rim).T @ solution.injected  # G is symmetric
+        moved = self.bare.green.columns(solution.rim) @ solution.injected
         field = self._pair_matrix @ (probes.bare + probes.gradient @ moved).T
         x, y = np.split(field, 2, axis=1)  # (pairs, C) each
         one, other = self._products

@@ -22,6 +22,7 @@ import scipy.sparse.linalg as spla
 from numpy.typing import DTypeLike, NDArray
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.inner_loop import LIBRARY, at
 
 
 class PackedGreensFunction:
@@ -46,13 +47,15 @@ class PackedGreensFunction:
         found = self.lower.take(np.where(row >= columns, lower, upper))
         return np.asarray(found, np.float64)
 
-    def rows(self, rows: IntArray) -> FloatArray:
-        """Potentials (r, S) at all nodes for unit currents into some."""
-        found = np.empty((len(rows), len(self._start)))
-        for potentials, row in zip(found, rows, strict=True):
-            start = self._start[row]
-            potentials[: row + 1] = self.lower[start : start + row + 1]
-            potentials[row + 1 :] = self.lower[self._start[row + 1 :] + row]
+    def columns(self, columns: IntArray) -> FloatArray:
+        """Potentials (S, c) at all nodes for unit currents into some."""
+        found = np.empty((len(self._start), len(columns)))
+        by_precision = (
+            at(self.lower if self.lower.dtype == dtype else None)
+            for dtype in (np.float32, np.float64)
+        )
+        columns = np.ascontiguousarray(columns, np.int64)
+        LIBRARY.columns_of(*by_precision, *found.shape, at(columns), at(found))
         return found
 
 
@@ -104,9 +107,9 @@ class GreensFunction:
         onto = self._between[np.ix_(used, used)] @ there[:, used].toarray().T
         return np.asarray(self._within[rows][:, columns].toarray() + here[:, used] @ onto)
 
-    def rows(self, rows: IntArray) -> FloatArray:
-        """Potentials (r, S) at all nodes for unit currents into some."""
-        return self.between(rows, np.arange(self._weights.shape[0]))
+    def columns(self, columns: IntArray) -> FloatArray:
+        """Potentials (S, c) at all nodes for unit currents into some."""
+        return self.between(np.arange(self._weights.shape[0]), columns)
 
     def packed(self, dtype: DTypeLike = np.float64) -> PackedGreensFunction:
         """All of it, of which a block is a look-up: up to hundreds of megabytes."""
