@@ -48,7 +48,6 @@ from tactomo_lab.scenes.drawing import (
 from tactomo_lab.scenes.simulation import SheetState
 
 Range = tuple[float, float]
-SensorOf = Callable[[SensorDescription], SensorDescription]
 
 SETTLED_FRAMES = 6  # of a scene that stays, before something happens
 SLIDE_FRAMES = 4
@@ -198,65 +197,10 @@ class Draw:
         return kinds[self.number % len(kinds)]
 
 
-@dataclass(frozen=True)
-class Regime:
-    """One thing that goes wrong."""
-
-    what: str
-    draw: Callable[[Draw], Plan]
-    sensor_of: SensorOf  # makes its cases' sensor of the one evaluated
-    can_happen: Callable[[SensorDescription], bool]  # whether it can go wrong with a sensor
-
-
-REGIMES: Final[dict[str, Regime]] = {}
-
-
-def regime(
-    name: str,
-    what: str,
-    sensor_of: SensorOf = lambda sensor: sensor,
-    can_happen: Callable[[SensorDescription], bool] = lambda _: True,
-) -> Callable[[Callable[[Draw], Plan]], Callable[[Draw], Plan]]:
-    """Let a function draw the cases of a regime."""
-
-    def add(draw: Callable[[Draw], Plan]) -> Callable[[Draw], Plan]:
-        REGIMES[name] = Regime(what, draw, sensor_of, can_happen)
-        return draw
-
-    return add
-
-
-def _has_two_sheets(description: SensorDescription) -> bool:
-    return len(description.channels) > 1
-
-
-def _has_magnitude(description: SensorDescription) -> bool:
-    return description.magnitude is not None
-
-
-def _has_structure(description: SensorDescription) -> bool:
-    return description.structure is not None
-
-
-@regime("ordinary", "Nothing goes wrong: what the others compare with.")
 def _ordinary(draw: Draw) -> Plan:
     return draw.plan(draw.scene())
 
 
-@regime("noise", "Noise of 10, 5 or 0 dB of the voltages' change.")
-def _noise_of_change(draw: Draw) -> Plan:
-    return replace(draw.plan(draw.scene()), snr_db=draw.in_turn(10, 5, 0))
-
-
-@regime("converter-noise", "Noise of 40, 30 or 20 dB of the voltages themselves.")
-def _noise_of_voltage(draw: Draw) -> Plan:
-    return replace(draw.plan(draw.scene()), snr_db=draw.in_turn(40, 30, 20), snr_of="voltage")
-
-
-@regime(
-    "weak-centre",
-    "A small contact at the centre, which electrodes see least; alone or with two large ones.",
-)
 def _weak_centre(draw: Draw) -> Plan:
     def alone() -> tuple[Press, ...]:
         return (draw.press((4, 7), within_mm=10),)
@@ -267,7 +211,6 @@ def _weak_centre(draw: Draw) -> Plan:
     return draw.plan(draw.tried(among_others if draw.number % 2 else alone))
 
 
-@regime("edges", "Contacts against the edges and in the corners.")
 def _edges(draw: Draw) -> Plan:
     half_x, half_y = np.array([draw.description.width_m, draw.description.height_m]) / 2
     frame_m = draw.description.sheet.frame_width_m
@@ -287,30 +230,9 @@ def _edges(draw: Draw) -> Plan:
     return draw.plan(draw.apart(1 + draw.number % 3, at_the_edge))
 
 
-@regime("near-touch", "Two contacts, 1 to 6 mm from touching.")
 def _near_touch(draw: Draw) -> Plan:
     least = draw.in_turn(1, 3, 5)
     return draw.plan(draw.pair((8, 14), (8, 14), (least, least + 1)))
-
-
-@regime("crowded", "Five or six small contacts.")
-def _crowded(draw: Draw) -> Plan:
-    return _small_ones(draw, 5 + draw.number % 2)
-
-
-@regime("many", "Eight to ten small contacts.")
-def _many(draw: Draw) -> Plan:
-    return _small_ones(draw, 8 + draw.number % 3)
-
-
-@regime("crowded-soft", "Five or six small balls.")
-def _crowded_soft(draw: Draw) -> Plan:
-    return _small_ones(draw, 5 + draw.number % 2, lambda: True)
-
-
-@regime("crowded-mixed", "Five or six small contacts, flat ones and balls.")
-def _crowded_mixed(draw: Draw) -> Plan:
-    return _small_ones(draw, 5 + draw.number % 2, lambda: draw.rng.random() < 0.5)
 
 
 def _small_ones(draw: Draw, count: int, is_ball: Callable[[], bool] = lambda: False) -> Plan:
@@ -322,35 +244,15 @@ def _small_ones(draw: Draw, count: int, is_ball: Callable[[], bool] = lambda: Fa
     return draw.plan(draw.apart(count, small, gap_mm=6))
 
 
-@regime("small-by-large", "A small contact beside a large one.")
-def _small_beside_large(draw: Draw) -> Plan:
-    return draw.plan(draw.pair((18, 24), (4, 6), (3, 8)))
+def _by_converter(plan: Plan) -> Plan:
+    return replace(plan, snr_db=CONVERTER_DB, snr_of="voltage")
 
 
-@regime("light", "5 to 90 kPa: structure not saturated, nothing in the magnitude channel.")
-def _light(draw: Draw) -> Plan:
-    return replace(
-        draw.plan(draw.scene(pressure_kpa=(5, 90))), snr_db=CONVERTER_DB, snr_of="voltage"
-    )
-
-
-@regime("soft", "Balls, under which the pressure falls to the rim.")
 def _soft(draw: Draw) -> Plan:
     def ball() -> Press:
         return draw.press((10, 20), pressure_kpa=SOFT_KPA, profile="dome")
 
-    plan = draw.plan(draw.apart(1 + draw.number % 3, ball))
-    return replace(plan, snr_db=CONVERTER_DB, snr_of="voltage")
-
-
-@regime("hand-made", "Electrodes 1 mm off, contact impedances by 30 %, sheets uneven by 10 %.")
-def _hand_made(draw: Draw) -> Plan:
-    return _by_hand(draw.plan(draw.scene()), _displaced_m(draw))
-
-
-@regime("soft-hand-made", "Balls on a skin made by hand.")
-def _soft_hand_made(draw: Draw) -> Plan:
-    return _by_hand(_soft(draw), _displaced_m(draw))
+    return _by_converter(draw.plan(draw.apart(1 + draw.number % 3, ball)))
 
 
 def _displaced_m(draw: Draw) -> FloatArray:
@@ -363,23 +265,12 @@ def _by_hand(plan: Plan, displaced_m: FloatArray) -> Plan:
     )
 
 
-@regime("mixed", "Flat ellipses, rectangles, rings and balls side by side, on a skin made by hand.")
-def _mixed(draw: Draw) -> Plan:
-    return by_hand_as_told(draw, draw.apart(1 + draw.number % 4, draw.any_kind))
-
-
 def by_hand_as_told(draw: Draw, *frames: Sequence[Press]) -> Plan:
     """A plan on a skin made by hand, electrodes off by up to 1 mm, that answers as described."""
     off_m = draw.mm * draw.rng.uniform(-1, 1, draw.description.electrode_count)
-    plan = _by_hand(as_described(draw.description, *frames), off_m)
-    return replace(plan, snr_db=CONVERTER_DB, snr_of="voltage")
+    return _by_converter(_by_hand(as_described(draw.description, *frames), off_m))
 
 
-@regime(
-    "overload",
-    "One to three presses, the first or all beyond the response table's end.",
-    can_happen=_has_magnitude,
-)
 def _overload(draw: Draw) -> Plan:
     assert draw.description.magnitude is not None
     end_kpa = draw.description.magnitude.response.pressure_kpa[-1]
@@ -389,17 +280,15 @@ def _overload(draw: Draw) -> Plan:
         return replace(press, pressure_kpa=end_kpa * draw.rng.uniform(*OVERLOAD))
 
     rest = others if draw.number % 2 else map(beyond, others)
-    plan = draw.plan((beyond(first), *rest))
-    return replace(plan, snr_db=CONVERTER_DB, snr_of="voltage")
+    return _by_converter(draw.plan((beyond(first), *rest)))
 
 
-@regime("palm", "A pad or a palm, 60 mm across or more, that comes slowly.")
 def _palm(draw: Draw) -> Plan:
     (palm,) = draw.apart(1, lambda: _draw_palm(draw))
     shares = np.linspace(0, 1, PALM_FRAMES + 1)[1:].tolist()
     comes = [(replace(palm, pressure_kpa=share * palm.pressure_kpa),) for share in shares]
     frames = [*[()] * PALM_REST_FRAMES, *comes, *[comes[-1]] * PALM_REST_FRAMES]
-    return replace(draw.plan(*frames), snr_db=CONVERTER_DB, snr_of="voltage")
+    return _by_converter(draw.plan(*frames))
 
 
 def _draw_palm(draw: Draw) -> Press:
@@ -427,9 +316,6 @@ def one_graded_sheet(description: SensorDescription) -> SensorDescription:
     return description.model_copy(update=taken)
 
 
-@regime(
-    "graded", "One sheet that answers from 0 kPa; punches and balls of 40 to 280.", one_graded_sheet
-)
 def _graded(draw: Draw) -> Plan:
     def punch_or_ball() -> Press:
         profile: Profile = "dome" if draw.rng.random() < 0.5 else "flat"
@@ -439,52 +325,27 @@ def _graded(draw: Draw) -> Plan:
     return replace(plan, opposite=False)  # conductivity cannot fall by more than all of it
 
 
-@regime("wrong-contrast", "A contrast of 3 or 1000 where 100 was told.", can_happen=_has_structure)
-def _wrong_contrast(draw: Draw) -> Plan:
-    return replace(draw.plan(draw.scene()), contrast=draw.in_turn(3, 1000))
+def _open_lead(draw: Draw, *levels: float, currents: tuple[float, ...], before: int = 0) -> Plan:
+    """A lead that opens after so many good frames, and floats to levels in turn."""
+    scene = draw.scene() if before else None
+    lead = BadLead(draw.electrode(), draw.in_turn(*levels), draw.in_turn(*currents))
+    plan = draw.plan(*[scene or draw.scene()] * (before + 1))
+    return replace(plan, lead=lead, at_fault=draw.sheet())
 
 
-@regime(
-    "wrong-sign",
-    "The magnitude channel changes against the sign told.",
-    can_happen=can_be_opposite,
-)
-def _wrong_sign(draw: Draw) -> Plan:
-    return replace(draw.plan(draw.scene()), sign_told=False)
-
-
-@regime("dead-lead", "A lead that opens after the tare.")
-def _dead_lead(draw: Draw) -> Plan:
-    lead = BadLead(draw.electrode(), level=draw.in_turn(0, 3, -3))
-    return replace(draw.plan(draw.scene()), lead=lead, at_fault=draw.sheet())
-
-
-@regime("intermittent", "A lead that opens in the last of many good frames.")
-def _intermittent_lead(draw: Draw) -> Plan:
-    scene = draw.scene()
-    lead = BadLead(draw.electrode(), level=draw.in_turn(0, 3), current=draw.in_turn(1e-3, 0.3))
-    return replace(draw.plan(*[scene] * (SETTLED_FRAMES + 1)), lead=lead, at_fault=draw.sheet())
-
-
-@regime("loose", "An electrode's contact impedance grows 30-fold after the tare.")
 def _loose_electrode(draw: Draw) -> Plan:
     factors = np.ones(draw.description.electrode_count)
     factors[draw.electrode()] = 30.0
-    return replace(
-        draw.plan(draw.scene()),
-        later=SheetState(impedance=tuple(factors.tolist())),
-        at_fault=draw.sheet(),
-    )
+    later = SheetState(impedance=tuple(factors.tolist()))
+    return replace(draw.plan(draw.scene()), later=later, at_fault=draw.sheet())
 
 
-@regime("displaced", "An electrode that sits 2 to 4 mm off its place.")
 def _displaced_electrode(draw: Draw) -> Plan:
     off = np.zeros(draw.description.electrode_count)
     off[draw.electrode()] = draw.rng.choice([-1, 1]) * draw.rng.uniform(2, 4) * draw.mm
     return replace(draw.plan(draw.scene()), displaced_m=tuple(off.tolist()))
 
 
-@regime("swapped", "Two leads of one sheet that were exchanged.")
 def _swapped_electrodes(draw: Draw) -> Plan:
     order = list(range(draw.description.electrode_count))
     first = draw.electrode()
@@ -494,52 +355,104 @@ def _swapped_electrodes(draw: Draw) -> Plan:
     return replace(draw.plan(draw.scene()), tared=wired, later=wired, at_fault=draw.sheet())
 
 
-@regime("drift", "Sheets 1 to 4 % better or worse conductors than at the tare, unevenly so.")
-def _drift(draw: Draw) -> Plan:
-    return _drifted(draw, draw.plan(draw.scene()))
-
-
-@regime("drift-at-rest", "Drift as above, and nothing presses.")
-def _drift_at_rest(draw: Draw) -> Plan:
-    return _drifted(draw, draw.plan(()))
-
-
 def _drifted(draw: Draw, plan: Plan) -> Plan:
     drifted = SheetState(
         warming=draw.in_turn(-1, 1) * draw.rng.uniform(0.01, 0.04),
         drift=draw.rng.uniform(0.005, 0.02),
     )
-    return replace(plan, later=drifted, snr_db=CONVERTER_DB, snr_of="voltage")
+    return _by_converter(replace(plan, later=drifted))
 
 
-@regime("stretched", "A sheet 2 to 5 % longer along x than described.")
-def _stretched(draw: Draw) -> Plan:
-    return replace(draw.plan(draw.scene()), stretch=draw.rng.uniform(0.02, 0.05))
-
-
-@regime(
-    "one-scan-apart",
-    "A sliding contact, the structure scan one behind.",
-    can_happen=_has_two_sheets,
-)
-def _behind(draw: Draw) -> Plan:
-    return replace(draw.plan(*draw.slide((4, 10))), behind=1)
-
-
-@regime("jump", "A contact that is elsewhere in the next frame.")
 def _jump(draw: Draw) -> Plan:
     places = draw.apart(2 + draw.number % 2, lambda: draw.press((8, 14)))
     here, there, *others = places
     return draw.plan(*[(here, *others)] * SETTLED_FRAMES, (there, *others))
 
 
-@regime(
-    "lost-scans",
-    "A sliding contact, its last 1 to 3 structure scans lost.",
-    can_happen=_has_two_sheets,
-)
-def _lost_scans(draw: Draw) -> Plan:
-    return replace(draw.plan(*draw.slide((3, 8))), lost=int(draw.in_turn(1, 2, 3)))
+@dataclass(frozen=True)
+class Regime:
+    """One thing that goes wrong."""
+
+    draw: Callable[[Draw], Plan]
+    # whether it can go wrong with a sensor
+    can_happen: Callable[[SensorDescription], bool] = lambda _: True
+    # makes its cases' sensor of the one evaluated
+    sensor_of: Callable[[SensorDescription], SensorDescription] = lambda sensor: sensor
+
+
+def _has(*channels: Channel) -> Callable[[SensorDescription], bool]:
+    return lambda description: set(channels) <= set(description.channels)
+
+
+REGIMES: Final[dict[str, Regime]] = {
+    # nothing goes wrong: what the others compare with
+    "ordinary": Regime(_ordinary),
+    # of the voltages' change, and of the voltages themselves
+    "noise": Regime(lambda d: replace(_ordinary(d), snr_db=d.in_turn(10, 5, 0))),
+    "converter-noise": Regime(
+        lambda d: replace(_ordinary(d), snr_db=d.in_turn(40, 30, 20), snr_of="voltage")
+    ),
+    # a small contact where electrodes see least; alone or with two large ones
+    "weak-centre": Regime(_weak_centre),
+    "edges": Regime(_edges),
+    # two contacts, 1 to 6 mm from touching
+    "near-touch": Regime(_near_touch),
+    # small contacts, small balls, and both
+    "crowded": Regime(lambda d: _small_ones(d, 5 + d.number % 2)),
+    "many": Regime(lambda d: _small_ones(d, 8 + d.number % 3)),
+    "crowded-soft": Regime(lambda d: _small_ones(d, 5 + d.number % 2, lambda: True)),
+    "crowded-mixed": Regime(
+        lambda d: _small_ones(d, 5 + d.number % 2, lambda: d.rng.random() < 0.5)
+    ),
+    "small-by-large": Regime(lambda d: d.plan(d.pair((18, 24), (4, 6), (3, 8)))),
+    # structure not saturated, nothing in the magnitude channel
+    "light": Regime(lambda d: _by_converter(d.plan(d.scene(pressure_kpa=(5, 90))))),
+    # balls, under which the pressure falls to the rim
+    "soft": Regime(_soft),
+    # electrodes 1 mm off, contact impedances by 30 %, sheets uneven by 10 %
+    "hand-made": Regime(lambda d: _by_hand(_ordinary(d), _displaced_m(d))),
+    "soft-hand-made": Regime(lambda d: _by_hand(_soft(d), _displaced_m(d))),
+    # `KINDS` side by side on a skin made by hand
+    "mixed": Regime(lambda d: by_hand_as_told(d, d.apart(1 + d.number % 4, d.any_kind))),
+    # the first press, or all, beyond the response table's end
+    "overload": Regime(_overload, _has(Channel.MAGNITUDE)),
+    # 60 mm across or more, that comes slowly
+    "palm": Regime(_palm),
+    # one sheet that answers from 0 kPa; punches and balls
+    "graded": Regime(_graded, sensor_of=one_graded_sheet),
+    # where 100 was told
+    "wrong-contrast": Regime(
+        lambda d: replace(_ordinary(d), contrast=d.in_turn(3, 1000)), _has(Channel.STRUCTURE)
+    ),
+    # the magnitude channel changes against the sign told
+    "wrong-sign": Regime(lambda d: replace(_ordinary(d), sign_told=False), can_be_opposite),
+    # a lead that opens after the tare, and in the last of many good frames
+    "dead-lead": Regime(lambda d: _open_lead(d, 0, 3, -3, currents=(1e-3,))),
+    "intermittent": Regime(
+        lambda d: _open_lead(d, 0, 3, currents=(1e-3, 0.3), before=SETTLED_FRAMES)
+    ),
+    # an electrode's contact impedance grows 30-fold after the tare
+    "loose": Regime(_loose_electrode),
+    # an electrode 2 to 4 mm off its place
+    "displaced": Regime(_displaced_electrode),
+    # two leads of one sheet that were exchanged
+    "swapped": Regime(_swapped_electrodes),
+    # sheets 1 to 4 % better or worse conductors than at the tare, unevenly so
+    "drift": Regime(lambda d: _drifted(d, _ordinary(d))),
+    "drift-at-rest": Regime(lambda d: _drifted(d, d.plan(()))),
+    # 2 to 5 % longer along x than described
+    "stretched": Regime(lambda d: replace(_ordinary(d), stretch=d.rng.uniform(0.02, 0.05))),
+    # a sliding contact, the structure scan one behind
+    "one-scan-apart": Regime(
+        lambda d: replace(d.plan(*d.slide((4, 10))), behind=1), _has(*Channel)
+    ),
+    # a contact that is elsewhere in the next frame
+    "jump": Regime(_jump),
+    # a sliding contact, its last 1 to 3 structure scans lost
+    "lost-scans": Regime(
+        lambda d: replace(d.plan(*d.slide((3, 8))), lost=int(d.in_turn(1, 2, 3))), _has(*Channel)
+    ),
+}
 
 
 def can_happen(name: str, description: SensorDescription) -> bool:
