@@ -1,10 +1,9 @@
-"""Faults between the skin and the daemon: cables, noise, lost channels, devices that restart."""
+"""Faults between the skin and the daemon: cables, noise, devices of no use."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,10 +11,7 @@ import pytest
 from daemon_process import DaemonProcess
 from ears import Ears
 from pty_skin import Playing, PtySkin, Scenes, still
-from tactomo.twin import Twin, TwinConfig
-from tactomo_client import request
 from tactomo_client.messages import array_from_wire
-from tactomo_models import SensorDescription, SkinSimulator
 from tactomo_protocol import Channel, encode
 from waiting import wait_until
 
@@ -41,10 +37,6 @@ def wait_until_lost(daemon: DaemonProcess) -> None:
     wait_until(
         lambda: not any(port["connected"] for port in daemon.status()["ports"]), "both ports' loss"
     )
-
-
-def wait_until_told(daemon: DaemonProcess, event: str) -> None:
-    wait_until(lambda: daemon.told(event), f"{event} in its log")
 
 
 def unplug_and_replug(times: int, daemon: DaemonProcess, skin: PtySkin, ears: Ears) -> list[float]:
@@ -243,94 +235,6 @@ def test_a_burst_of_noise(
     assert meanwhile >= 0.7 * took_s * 20 - 3
     assert grown_mb < 20
     assert back_s < BACK_S
-
-
-@pytest.fixture(scope="module")
-def twin_skin(description: SensorDescription) -> SkinSimulator:
-    return SkinSimulator(description, 4e-3, unevenness=0.03, impedance_spread=0.1)
-
-
-@pytest.fixture
-def twin(
-    tmp_path: Path, description: SensorDescription, twin_skin: SkinSimulator
-) -> Iterator[Callable[[], Twin]]:
-    """Power up a twin on two lines of fixed names."""
-    running: list[Twin] = []
-
-    def begin() -> Twin:
-        config = TwinConfig(
-            description, ports=2, control="tcp://127.0.0.1:0", link_folder=tmp_path / "lines"
-        )
-        running.append(Twin(config, twin_skin))
-        running[-1].start()
-        return running[-1]
-
-    yield begin
-    for one in running:
-        one.stop()
-
-
-@pytest.mark.faults
-@pytest.mark.fault(
-    "One channel lost for a minute",
-    "flagged; maps continue at the same rate; both channels within 1 s of the channel's return",
-    "the twin omits the structure channel for 60 s, under a press of 180 kPa",
-)
-def test_a_channel_is_lost_for_a_minute(
-    twin: Callable[[], Twin], start: Start, listen: Listen, figure: Figure
-) -> None:
-    device = twin()
-    daemon = start(list(device.ports))
-    ears = listen(daemon, "map")
-    wait_until_told(daemon, "tared")
-    request("press", device.control, x_mm=10.0, y_mm=-10.0)
-    whole = ears.wait(lambda h: not h.fields["flags"] and h.fields["contacts"], "a contact")
-    muted_s = time.monotonic()
-    request("mute", device.control, channel="structure", seconds=60.0)
-    began = len(ears.heard)
-    missing = ears.wait(lambda h: "structure_missing" in h.fields["flags"], "the flag", began)
-    time.sleep(max(0.0, muted_s + 60.0 - time.monotonic()))
-    during = ears.heard[began:]
-    back = ears.wait(lambda h: not h.fields["flags"], "both channels", len(ears.heard))
-    gaps_s = np.diff([heard.arrived_ns * 1e-9 for heard in during])
-    flagged = [heard for heard in during if "structure_missing" in heard.fields["flags"]]
-    seen = [heard for heard in flagged if heard.fields["contacts"]]
-    back_s = back.arrived_ns * 1e-9 - muted_s - 60.0
-    figure(
-        f"flagged after {missing.arrived_ns * 1e-9 - muted_s:.2f} s; {len(during)} maps in 60 s, "
-        f"the contact in {len(seen) / len(flagged):.0%} of them, longest gap {gaps_s.max():.2f} s; "
-        f"both channels {back_s:.2f} s after the return"
-    )
-    assert whole.fields["structure"] is not None
-    assert all(heard.fields["map"] is not None for heard in flagged)
-    assert len(during) > 0.9 * 60 * 20
-    assert gaps_s.max() < 0.5
-    assert back_s < BACK_S
-
-
-@pytest.mark.faults
-@pytest.mark.fault(
-    "The device restarts: counter and clock at 0 again, cables pulled for a moment",
-    "an event; frames within 1 s of the device's return, on the old reference",
-    "the twin is stopped and a new one started under the same names",
-)
-def test_the_device_restarts(
-    twin: Callable[[], Twin], start: Start, listen: Listen, figure: Figure
-) -> None:
-    device = twin()
-    daemon = start(list(device.ports))
-    ears = listen(daemon)
-    wait_until_told(daemon, "tared")
-    device.stop()
-    wait_until_lost(daemon)
-    heard, begin_s = len(ears.heard), time.monotonic()
-    twin()
-    back = ears.wait(lambda h: not h.fields["flags"], "frames again", heard)
-    back_s = back.arrived_ns * 1e-9 - begin_s
-    wait_until_told(daemon, "device_restarted")
-    figure(f"{back_s:.2f} s, first counter {back.fields['scan_counter']}")
-    assert back_s < BACK_S + 1.0  # the twin's own start is in it
-    assert len(daemon.told("tared")) == 1
 
 
 @pytest.mark.faults
