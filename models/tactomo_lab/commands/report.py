@@ -148,11 +148,16 @@ def usable(sensor: SensorDescription, methods: Sequence[str]) -> list[str]:
 
     Raises TactomoError where none does.
     """
-    from tactomo_lab.evaluation.trade_off import left_out
+    from tactomo_models import ModelError
+    from tactomo_models.methods.registry import check_method
 
-    missing = left_out(sensor, methods)
-    for method, reason in missing.items():
-        say(f"left out: {method}: {reason}", err=True)
-    if len(missing) == len(methods):
+    found = []
+    for method in methods:
+        try:
+            check_method(method, sensor)
+            found.append(method)
+        except ModelError as error:  # such as a network that nobody trained
+            say(f"left out: {method}: {error}", err=True)
+    if not found:
         raise TactomoError("none of the methods is available", "choose others with --method")
-    return [method for method in methods if method not in missing]
+    return found

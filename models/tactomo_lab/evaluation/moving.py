@@ -91,13 +91,10 @@ class Step:
 
 
 def choreography(
-    indenters: Presses,  # by the names in `INDENTERS`, radii up to 12 mm; places are given here
-    millimetre_m: float,  # a millimetre on the paper's sensor, on this one
+    # one of `INDENTERS`, radii up to 12 mm, at x and y in millimetres of the paper's sensor
+    at: Callable[[str, float, float], Press],
 ) -> list[Step]:
     """All frames."""
-
-    def at(name: str, x_mm: float, y_mm: float) -> Press:
-        return replace(indenters[name], x_m=x_mm * millimetre_m, y_m=y_mm * millimetre_m)
 
     def path(
         name: str, start: tuple[float, float], end: tuple[float, float], frames: int
@@ -179,26 +176,23 @@ def _draw_choreography(description: SensorDescription, rng: np.random.Generator)
     quarters, mirrored = int(rng.integers(4)), bool(rng.integers(2))
     again = deepcopy(rng)  # the same indenters, smaller
 
-    def across(width_m: float, rng: np.random.Generator) -> list[Step]:
+    def across(rng: np.random.Generator, width_m: float, x_m: float, y_m: float) -> list[Step]:
         millimetre_m = width_m / 150
-        steps = choreography(_draw_indenters(rng, millimetre_m), millimetre_m)
-        return [_changed(step, lambda press: _turned(press, quarters, mirrored)) for step in steps]
+        indenters = _draw_indenters(rng, millimetre_m)
 
-    steps = across(description.width_m, rng)
-    if not _fits(description, steps):
-        width_m, x_m, y_m = _roomiest_place(description)
-
-        def moved(press: Press) -> Press:
+        def at(name: str, x_mm: float, y_mm: float) -> Press:
+            there = replace(indenters[name], x_m=x_mm * millimetre_m, y_m=y_mm * millimetre_m)
+            press = _turned(there, quarters, mirrored)
             return replace(press, x_m=press.x_m + x_m, y_m=press.y_m + y_m)
 
-        steps = [_changed(step, moved) for step in across(width_m, again)]
+        return choreography(at)
+
+    steps = across(rng, description.width_m, 0.0, 0.0)
+    if not _fits(description, steps):
+        steps = across(again, *_roomiest_place(description))
         if not _fits(description, steps):
             raise DataError(f"no room for the choreography on {description.name!r}")
     return steps
-
-
-def _changed(step: Step, change: Callable[[Press], Press]) -> Step:
-    return replace(step, presses={name: change(press) for name, press in step.presses.items()})
 
 
 def _fits(description: SensorDescription, steps: Iterable[Step]) -> bool:

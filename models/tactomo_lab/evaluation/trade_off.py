@@ -14,10 +14,8 @@ from typing import Final, Literal
 
 import numpy as np
 from tactomo_models.batch import BUDGET_S
-from tactomo_models.errors import ModelError
-from tactomo_models.methods.registry import BUDGETED, check_method
+from tactomo_models.methods.registry import BUDGETED
 from tactomo_models.reconstruct import DEFAULT_BUDGET_S
-from tactomo_models.sensor.description import SensorDescription
 
 from tactomo_lab.evaluation.play import Outcome, Variant
 from tactomo_lab.scenes.measures import Score, Summary, summarise
@@ -59,17 +57,6 @@ def points_of(outcomes: Iterable[Outcome]) -> list[Point]:
         of = (kind, outcome.score.snr_db, outcome.variant)
         scores.setdefault(of, []).append(outcome.score)
     return [Point(*of, summarise(own)) for of, own in scores.items()]
-
-
-def left_out(description: SensorDescription, methods: Iterable[str]) -> dict[str, str]:
-    """Methods that are not to be had for a sensor, and why: a network that nobody trained."""
-    reasons = {}
-    for method in methods:
-        try:
-            check_method(method, description)
-        except ModelError as error:
-            reasons[method] = str(error)
-    return reasons
 
 
 def panels(points: Iterable[Point]) -> Iterator[list[Point]]:

@@ -9,7 +9,7 @@ paper's; on another sensor they scale with its shorter side and with its own tab
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -21,6 +21,7 @@ from tactomo_models.sensor.description import SensorDescription
 from tactomo_lab.scenes.drawing import (
     can_be_opposite,
     draw_contrast,
+    draw_indenter,
     placed_apart,
     scale_of,
     seed_of,
@@ -31,7 +32,6 @@ END_KPA = 300.0  # of the response table that the pressures below are for
 PAPER_CONTACTS = 4
 PAPER_CHANGE = (0.05, 0.25)  # 0.95 to 0.75 S/m in a sheet of 1 S/m
 PAPER_CONTRAST = 100.0
-PAPER_HALF_AXIS_M = (0.007, 0.020)  # the paper leaves sizes open
 
 # Shares of scenes with none to ten contacts.
 ROBUST_CONTACTS = (0.03, 0.20, 0.20, 0.18, 0.16, 0.06, 0.06, 0.03, 0.03, 0.03, 0.02)
@@ -85,17 +85,11 @@ def paper_presses(
     """
     assert description.magnitude is not None
     curve = PressureCurve.of_response(description.magnitude.response)
-    least, most = (scale_of(description) * half_axis for half_axis in PAPER_HALF_AXIS_M)
+    scale = scale_of(description)
 
     def one() -> Press:
-        long = rng.uniform(least, most)
-        return Press(
-            *_anywhere(description, rng),
-            pressure_kpa=float(curve.pressure(np.array(rng.uniform(*PAPER_CHANGE)))),
-            radius_m=long,
-            radius_y_m=rng.uniform(max(least, long / 2), long),
-            angle_rad=rng.uniform(0, np.pi),
-        )
+        change = draw_indenter(description, rng, "ellipse", pressure_kpa=PAPER_CHANGE, scale=scale)
+        return replace(change, pressure_kpa=float(curve.pressure(np.array(change.pressure_kpa))))
 
     return placed_apart(description, count, 0.0, one)
 

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tactomo_lab.evaluation.moving import (
-    INDENTERS,
     Step,
     choreography,
     follow,
@@ -32,7 +31,7 @@ PLACES_MM = {"A": (-38, -38), "B": (35, 10)}
 def test_contacts_stay_on_the_sheet_and_apart_unless_they_merge(
     paper: SensorDescription, radius_m: float
 ) -> None:
-    steps = choreography(dict.fromkeys(INDENTERS, Press(0, 0, 180.0, radius_m)), 1e-3)
+    steps = choreography(lambda _, x, y: Press(x * 1e-3, y * 1e-3, 180.0, radius_m))
     for step in steps:
         for press in step.presses.values():
             x, y = outline_of(press)
@@ -45,7 +44,7 @@ def test_contacts_stay_on_the_sheet_and_apart_unless_they_merge(
 
 
 def test_what_happens_in_it() -> None:
-    steps = choreography(dict.fromkeys(INDENTERS, Press(0, 0, 180.0, 0.01)), 1e-3)
+    steps = choreography(lambda _, x, y: Press(x * 1e-3, y * 1e-3, 180.0, 0.01))
     assert sum(step.tare for step in steps) == 1
     assert {step.lost for step in steps} == {
         (),

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from tactomo_lab.evaluation.play import Variant, play
 from tactomo_lab.evaluation.trade_off import (
     Point,
-    left_out,
     panels,
     pareto_front,
     points_of,
@@ -85,10 +84,3 @@ def test_still_scenes_are_measured_under_each_budget(
     # A millisecond of work is about what a linear image takes.
     assert max(seconds[:2]) < seconds[2] <= patient.summary.seconds_99
     assert hasty.summary.warned == 1
-
-
-def test_methods_whose_network_nobody_trained_are_left_out(small: SensorDescription) -> None:
-    missing = left_out(small, available_methods())
-    assert {"network", "cnn-single"} <= missing.keys()
-    assert not {"auto", "levelset", "noser"} & missing.keys()
-    assert all(missing.values())
