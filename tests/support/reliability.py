@@ -27,7 +27,8 @@ hangs, a clock that is set, full, stuck and dead disks, hostile files.
 
 These promises hold:
 
-- Frames return within a second after pulled cables, restarted or exchanged boards, silence, noise.
+- Frames return within a second after pulled cables, silence, noise; and after another board or a
+  restart of one.
 - No frame contains damaged bytes; each intact scan is published, or counted as dropped.
 - Memory, threads and descriptors stay constant over a million scans and many subscribers.
 - Hostile boards, files and web pages never end the daemon.
