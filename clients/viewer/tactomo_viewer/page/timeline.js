@@ -44,6 +44,7 @@ export class Timeline {
 
   add(frame) {
     const at = frame.receivedAt - frame.age_ms;
+    this.#closeUp(at);
     if (at - (this.frames.at(-1)?.at ?? -Infinity) < SPACING_MS) return;
     this.frames.push({ at, frame });
     const isKept = (item) => item.at > at - KEPT_MS || this.#isBeforePause(item.at);
@@ -51,7 +52,7 @@ export class Timeline {
     this.events = this.events.filter(isKept);
   }
 
-  /** Take it that a replay stands at the newest frame: the time until the next one is no outage. */
+  /** Take it that a replay waits at the newest frame: the strip leaves this time out. */
   stand() {
     const newest = this.frames.at(-1);
     if (newest) newest.stood = true;
@@ -67,7 +68,8 @@ export class Timeline {
   }
 
   pause() {
-    this.pausedAt ??= performance.now();
+    const newest = this.frames.at(-1);
+    this.pausedAt ??= newest?.stood ? newest.at : performance.now();
   }
 
   goLive() {
@@ -98,7 +100,7 @@ export class Timeline {
    */
   get shown() {
     const found = this.isPaused && (this.#frameAt(this.#moment) ?? this.frames[0]);
-    return found ? { ...found, isKnown: !this.#isOutage(found, this.#moment) } : null;
+    return found ? { ...found, isKnown: this.#moment - found.at <= this.options.gapMs } : null;
   }
 
   /** What was at the pointer, or at the moment looked at, in words; nothing where there is neither. */
@@ -106,8 +108,8 @@ export class Timeline {
     if ((this.pointer === null && !this.isPaused) || !this.options) return "";
     const at = this.pointer === null ? this.#moment : this.#time(this.pointer);
     const found = this.#frameAt(at);
-    const { unit } = this.options;
-    const contacts = !found || this.#isOutage(found, at) ? ["no data"]
+    const { unit, gapMs } = this.options;
+    const contacts = !found || at - found.at > gapMs ? ["no data"]
       : found.frame.contacts.map((contact) => {
         const force = quantityText(forceOf(contact), 0);
         return `${contact.id}: ${pressureText(contact, unit)}${force ? `, ${force} N` : ""}`;
@@ -161,9 +163,15 @@ export class Timeline {
     return this.isPaused ? this.pausedAt + Number(this.slider.value) : this.end;
   }
 
-  // Whether frames were missing between a frame and a moment before the next one.
-  #isOutage({ at, stood }, moment) {
-    return !stood && moment - at > this.options.gapMs;
+  // Move what was before a wait of the replay on to the frame that ends it.
+  #closeUp(at) {
+    const newest = this.frames.at(-1);
+    const wait = newest?.stood ? at - newest.at - SPACING_MS : 0;
+    if (!(wait > this.options?.gapMs)) return;
+    for (const item of [...this.frames, ...this.events]) item.at += wait;
+    if (!this.isPaused) return;
+    this.pausedAt += wait;
+    this.end += wait;
   }
 
   #frameAt(moment) {
@@ -241,17 +249,16 @@ export class Timeline {
 
   // Times without frames, with how long they were, and those of which no contacts say nothing.
   #outages(c, frames) {
+    const { gapMs } = this.options;
     const ends = [...frames.slice(1).map(({ at }) => at), this.end];
-    frames.forEach((item, i) => {
-      const { at, frame, stood } = item;
-      const isOutage = this.#isOutage(item, ends[i]);
+    frames.forEach(({ at, frame }, i) => {
+      const isGap = ends[i] - at > gapMs;
+      if (!isGap && areTouchesSeen(frame)) return;
       const [x0, x1] = [this.#x(at), this.#x(ends[i])];
-      if (isOutage || !areTouchesSeen(frame)) {
-        c.fillStyle = this.#hatch(isOutage ? this.theme.axis : this.theme.warn);
-        c.fillRect(x0, 0, x1 - x0, this.lanes.bottom);
-      }
-      const text = `${stood ? "replay waited" : "no data"} for ${seconds(ends[i] - at)}`;
-      if (ends[i] - at <= this.options.gapMs || c.measureText(text).width + 8 > x1 - x0) return;
+      c.fillStyle = this.#hatch(isGap ? this.theme.axis : this.theme.warn);
+      c.fillRect(x0, 0, x1 - x0, this.lanes.bottom);
+      const text = `no data for ${seconds(ends[i] - at)}`;
+      if (!isGap || c.measureText(text).width + 8 > x1 - x0) return;
       const [x, y, room] = [(x0 + x1) / 2, this.lanes.height / 2, c.measureText(text).width + 8];
       c.fillStyle = this.theme.background;
       c.fillRect(x - room / 2, y - 8, room, 16);

@@ -318,8 +318,8 @@ function helpText(canPress) {
     : "";
 }
 
-function pausedBanner({ frame, at, isKnown }, now) {
-  const detail = isKnown ? `The map shows the frame of ${seconds(now - at)} ago; the skin goes on.`
+function pausedBanner({ frame, at, isKnown, stood }, now) {
+  const detail = isKnown ? `The map shows the frame of ${seconds(now - at)} ago${stood ? "" : "; the skin goes on"}.`
     : `No data then: the newest frame before is of ${seconds(now - at)} ago.`;
   return { name: "paused", level: "info", title: "Looking back.", detail, frame };
 }
