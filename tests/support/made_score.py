@@ -27,7 +27,6 @@ PLAIN: Final = Score(
     seconds=0.1,
     shape="ellipse",
     contrast=30.0,
-    opposite=False,
     snr_db=40.0,
 )
 

@@ -1,10 +1,10 @@
 """The scenes that a pressure field has to explain, in rows: soft, graded, mixed, crowded, moving.
 
 Still scenes, each reconstructed from a cold start and run to its end, moving ones, and days of a
-skin that drifts. The rows of
-ordinary scenes, rectangles and rings are `still_scenes`'; each of the others is the regime of that
-name, of which the last frame counts. What counts is what a user is told: a bad map with no flag of
-`DISTRUST` is a silent failure, a good one with such a flag a false alarm.
+skin that drifts. The rows of ordinary scenes, rectangles and rings are `still_scenes`'; each of the
+others is the regime of that name, of which the last frame counts. What counts is what a user is
+told: a bad map with no flag of `DISTRUST` is a silent failure, a good one with such a flag a false
+alarm.
 """
 
 from __future__ import annotations

@@ -35,9 +35,6 @@ class Variant:
     # by a model of the work (`field_fit.Budget`); None leaves it to the case
     budget_s: float | None = None
 
-    def __str__(self) -> str:
-        return f"{self.method}, {self.budget_name}" if self.budget_name else str(self.method)
-
     @property
     def budget_name(self) -> str:
         """The budget in words, "20 ms"; nothing where there is none."""

@@ -151,10 +151,9 @@ class Score:
     misfit: float
     confidence: float
     seconds: float  #: that it took
-    #: shape, contrast, opposite, snr_db: of the case
+    #: shape, contrast, snr_db: of the case
     shape: str
     contrast: float
-    opposite: bool
     snr_db: float
     #: relative error of the force of all contacts together; NaN where none was reported
     force_error: float = float("nan")
@@ -229,7 +228,6 @@ def score(
         seconds=seconds,
         shape=case.shape,
         contrast=case.plan.contrast,
-        opposite=case.plan.opposite,
         snr_db=case.plan.snr_db,
         force_error=made.force_n / truth.force_n - 1 if truth.force_n else float("nan"),
     )

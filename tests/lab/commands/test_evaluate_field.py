@@ -44,9 +44,3 @@ def test_a_picture_that_cannot_be_is_told_before_the_work(
     result = tactomo("evaluate", "field", "--count", 1, "--picture", picture)
     assert result.returncode == 1
     assert told in result.stderr
-
-
-def test_an_unknown_row_is_a_usage_error(tactomo: Run) -> None:
-    result = tactomo("evaluate", "field", "--rows", "soft,loud")
-    assert result.returncode == 2
-    assert "'loud': give" in result.stderr

@@ -28,7 +28,7 @@ def changing(small: SensorDescription) -> Case:
     return mixed_sequence(small, "tuning", 0, "each change")
 
 
-@pytest.fixture(params=range(12))
+@pytest.fixture(params=range(4))
 def steps(paper: SensorDescription, request: pytest.FixtureRequest) -> list[Step]:
     return mixed_steps(Draw(paper, np.random.default_rng(request.param), request.param))
 
