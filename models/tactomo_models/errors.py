@@ -70,8 +70,8 @@ def explain_all(items: Iterable["ErrorDetails"]) -> list[str]:
 
 # What is allowed, by pydantic's kind of error, where pydantic's own words are for programmers.
 _ALLOWED: Final = {
-    "dict_type": "give a table of keys",
-    "model_type": "give a table of keys",
+    "dict_type": "give a table, [{key}]",
+    "model_type": "give a table, [{key}]",
     "tuple_type": "give a list, in brackets",
     "too_short": "give at least {min_length} entries",
     "too_long": "give at most {max_length} entries",
@@ -95,7 +95,7 @@ def explain(item: "ErrorDetails") -> str:
         return f"{key} is missing"
     is_beyond = kind.startswith(("less_than", "greater_than"))
     message = (
-        _ALLOWED[kind].format(**limits)
+        _ALLOWED[kind].format(key=key, **limits)
         if kind in _ALLOWED
         else item["msg"]
         .removeprefix("Value error, ")

@@ -56,7 +56,7 @@ def with_tables(tables: str) -> str:
             "Cell 1: give a name of lower",
         ),
         (with_tables("[mount]\nframe = ''"), "", "mount.frame = '': give a name of letters"),
-        (with_tables("[mount]\nplane = 1"), "", "mount.plane = 1: give a table of keys"),
+        (with_tables("[mount]\nplane = 1"), "", "mount.plane = 1: give a table, [mount.plane]"),
         (with_tables(f"{CELL}[[0.02, 0.02], [0.05, 0.02], [0.05, 0.05]]"), "", "off the sheet"),
         (
             with_tables(f"{CELL}[[-0.05, -0.05], [-0.01, -0.01], [-0.01, -0.05], [-0.05, -0.01]]"),
