@@ -35,7 +35,7 @@ def huber_sigma(deviations: FloatArray) -> float:
         limit = cut**2 * variance
         below = squares.searchsorted(limit)
         variance = float(sums[below] + (len(squares) - below) * limit) / len(squares) / kept
-    return variance**0.5
+    return float(variance**0.5)
 
 
 def median(values: FloatArray) -> float:
