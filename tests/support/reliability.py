@@ -22,8 +22,7 @@ real `tactomo daemon` process on real pseudo-terminals and ZeroMQ sockets: the f
 the method and the result. `make soak` and `-k` write their own rows anew. `ARGS='--scale 0.1'`
 shortens the long measures, and their rows then state the scale. All of the suite takes hours.
 `make test-all` tries more: exchanged and restarted boards, a channel that is lost, ports that come
-later, a frozen converter, a second skin, a tare under a press, a reconstruction that fails or
-hangs, a clock that is set, full, stuck and dead disks, hostile files.
+later, a reconstruction that fails or hangs, a clock that is set, full, stuck and dead disks.
 
 These promises hold:
 
