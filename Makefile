@@ -30,7 +30,7 @@ LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
 ON_ARM := --python-version 3.11 --python-platform aarch64-manylinux_2_28 --only-binary :all: \
   --no-emit-package tactomo-client --no-emit-package tactomo --no-annotate
 
-.PHONY: help setup run test test-lab test-all test-random test-long test-train test-peers faults soak firmware fuzz lint format schema pictures bench docs wheels release-check deb lock clean
+.PHONY: help setup run test test-lab test-all test-random test-long test-train test-peers faults soak fleet firmware fuzz lint format schema pictures bench docs wheels release-check deb lock clean
 
 help:            ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -71,6 +71,9 @@ faults: $(READY) ## every fault and measure (hours; a tenth: ARGS='--scale 0.1')
 
 soak: $(READY)   ## a million dual scans as fast as they are taken, and their row of that page
 	$(BIN)/pytest tests/faults -m '' -k soak --reliability docs/reliability.md $(ARGS)
+
+fleet: $(READY)  ## a thousand simulated skins through two Zenoh routers: docs/fleet.md
+	$(BIN)/python tests/support/fleet_measure.py $(ARGS)
 
 firmware:        ## the C firmware library's emulator of a skin: firmware_protocol/c/build
 	$(MAKE) -C firmware_protocol/c
