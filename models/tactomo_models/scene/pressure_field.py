@@ -122,7 +122,8 @@ class PressureField:
         spacing = description.width_m / (description.map.nodes_x - 1)
         end_kpa = graded.end_kpa if graded else 300.0
         onset = graded.onset_kpa / end_kpa if graded else 0.0
-        node_m2 = float(forward.node_areas_m2.mean())
+        # Of a node inside, which is one of the map's: along rims there are many small ones.
+        node_m2 = spacing * description.height_m / (description.map.nodes_y - 1)
         blur_m2 = of_triangles * node_m2 + of_step * (GRADED_WIDTH * spacing) ** 2
         largest = float(np.log(np.hypot(description.width_m, description.height_m) / 2))
         return cls(
