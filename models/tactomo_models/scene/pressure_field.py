@@ -122,8 +122,9 @@ class PressureField:
         spacing = description.width_m / (description.map.nodes_x - 1)
         end_kpa = graded.end_kpa if graded else 300.0
         onset = graded.onset_kpa / end_kpa if graded else 0.0
-        # Of a node inside, which is one of the map's: along rims there are many small ones.
-        node_m2 = spacing * description.height_m / (description.map.nodes_y - 1)
+        # Two triangles to a node: half of the sheet is in larger ones, whatever is along its rim.
+        areas_m2 = np.sort(forward.triangle_areas_m2)
+        node_m2 = 2 * float(areas_m2[areas_m2.cumsum().searchsorted(areas_m2.sum() / 2)])
         blur_m2 = of_triangles * node_m2 + of_step * (GRADED_WIDTH * spacing) ** 2
         largest = float(np.log(np.hypot(description.width_m, description.height_m) / 2))
         return cls(
