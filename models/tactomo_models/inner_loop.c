@@ -673,7 +673,6 @@ typedef struct {
   double half_width_m, offset_m, unit_kpa, blur_m2;
   int64_t forms;    /* columns of the form that any contact has: 3, 5 or 9 */
   int64_t is_sharp; /* outlines as sharp as the points can show them */
-  const Response *graded; /* the graded sheet's; NULL without */
 } Field;
 
 typedef struct {
@@ -684,11 +683,10 @@ typedef struct {
 
 /* One contact and its hole as they are, and as they are drawn on a graded sheet: smaller, and stronger,
  * for the mesh's blur; how the logarithm of that size goes by that of its own, over 1, and by gamma;
- * how strong that sheet's answer is drawn; how both go by all parameters; the square of how far from
- * its centre it may reach. */
+ * the square of how far from its centre it may reach. */
 typedef struct {
   Contact as_is, hole, smaller, smaller_hole;
-  double stronger, answer, by_size, by_edge, stronger_by[COLUMNS], answer_by[COLUMNS], reach2;
+  double stronger, by_size, by_edge, reach2;
 } Sizes;
 
 /* An outline at a point: t = phi / w, log q, and their derivatives by the form. */
@@ -713,24 +711,10 @@ static Contact contact_of(const double *each, double size) {
   return c;
 }
 
-/* What a blur leaves of a square of a size, 1 - blur but for large ones; how its logarithm goes by
- * that of the blur, over -1. */
-static double left_by(double blur, double *by) {
-  double held = tanh(blur / MOST_BLURRED), left = 1 - MOST_BLURRED * held;
-  *by = blur * (1 - held * held) / left;
-  return left;
-}
-
 static Sizes sizes_of(const Field *f, const double *each) {
   double moment = 2 * (each[EDGE] + 2), blur = moment * f->blur_m2 * exp(-2 * each[SIZE]);
-  double by_size, by_blur, slope = 0.0, contrast = 1.0;
-  double twice = 2 * each[EDGE] + 1, mean = (each[EDGE] + 1) / twice * f->unit_kpa; /* by itself */
-  if (f->graded) contrast += of_table(f->graded, mean * each[PEAK], &slope);
-  if (contrast <= LEAST) contrast = LEAST, slope = 0.0;
-  double left = left_by(blur, &by_size), size = each[SIZE] + log(left) / 2;
-  double answer = 1 / left_by(blur * sqrt(contrast), &by_blur);
-  double by_kpa = answer * by_blur * slope / contrast / 2;
-  double of_mean = f->unit_kpa * each[PEAK] / (twice * twice);
+  double held = tanh(blur / MOST_BLURRED), left = 1 - MOST_BLURRED * held;
+  double size = each[SIZE] + log(left) / 2, by_size = blur * (1 - held * held) / left;
   double longest = each[SIZE] + hypot(each[E1], each[E2]);
   for (int h = HARMONIC; h < PEAK; h++) longest += fabs(each[h]);
   double reach = exp(longest) + 2 * (f->half_width_m + f->offset_m);
@@ -739,13 +723,8 @@ static Sizes sizes_of(const Field *f, const double *each) {
                     .smaller = contact_of(each, size),
                     .smaller_hole = contact_of(each, size - log(2)),
                     .stronger = 1 / left,
-                    .answer = answer,
                     .by_size = by_size,
                     .by_edge = -by_size / moment,
-                    .stronger_by = {[SIZE] = -2 * by_size / left, [EDGE] = 2 * by_size / left / moment},
-                    .answer_by = {[SIZE] = -2 * by_blur * answer,
-                                  [EDGE] = 2 * by_blur * answer / moment - by_kpa * of_mean,
-                                  [PEAK] = by_kpa * mean},
                     .reach2 = reach * reach};
 }
 
@@ -878,18 +857,17 @@ static void by_parameters(const Field *f, const double *c, const Pressed *p, int
  *
  * Out, for each point that a contact reaches, or for all where `points` is NULL: which it is, the
  * share enclosed (all of it within sharp outlines) and the pressure there, the share pressed and the
- * pressure as drawn on a graded sheet, and the share with which it answers. Returns how many, -1
- * without memory.
+ * pressure as drawn on a graded sheet. Returns how many, -1 without memory.
  */
 int64_t draw(const Field *f, int64_t count, const double *each, int64_t n, const double *x,
              const double *y, int64_t *points, double *enclosed, double *enclosed_kpa,
-             double *share, double *pressure, double *answering) {
+             double *share, double *pressure) {
   Sizes *contact = malloc(sizeof(Sizes) * (count + 1));
   if (!contact) return -1;
   for (int64_t k = 0; k < count; k++) contact[k] = sizes_of(f, each + COLUMNS * k);
   int64_t there = 0;
   for (int64_t i = 0; i < n; i++) {
-    double no_wide = 1.0, no_share = 1.0, stronger = 0.0, answer = 0.0;
+    double no_wide = 1.0, no_share = 1.0, stronger = 0.0;
     double of_as_is = 0.0, as_is = 0.0, of_drawn = 0.0, drawn = 0.0;
     int hit = 0;
     for (int64_t k = 0; k < count; k++) {
@@ -901,14 +879,12 @@ int64_t draw(const Field *f, int64_t count, const double *each, int64_t n, const
       of_as_is += within, as_is += within * p.as_is.pressure;
       of_drawn += p.drawn.share, drawn += p.drawn.share * p.drawn.pressure;
       stronger += p.drawn.share * contact[k].stronger;
-      answer += p.drawn.share * contact[k].answer;
     }
     if (points && !hit) continue;
     if (points) points[there] = i;
     of_as_is = fmax(of_as_is, 1e-12), of_drawn = fmax(of_drawn, 1e-12);
     enclosed[there] = 1 - no_wide, enclosed_kpa[there] = as_is / of_as_is;
-    share[there] = (1 - no_share) * stronger / of_drawn, pressure[there] = drawn / of_drawn;
-    answering[there++] = (1 - no_share) * answer / of_drawn;
+    share[there] = (1 - no_share) * stronger / of_drawn, pressure[there++] = drawn / of_drawn;
   }
   free(contact);
   return there;
@@ -916,13 +892,12 @@ int64_t draw(const Field *f, int64_t count, const double *each, int64_t n, const
 
 /* Derivatives of what `draw` gives, by the parameters that are free; see `_Contacts.slopes`.
  *
- * index: (count, COLUMNS) place of each among `free` parameters, -1 where it is fixed. Out: five of
+ * index: (count, COLUMNS) place of each among `free` parameters, -1 where it is fixed. Out: four of
  * (n, parameters). Returns -1 without memory.
  */
 int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, const double *x,
                 const double *y, const int64_t *index, int64_t parameters, double *by_enclosed,
-                double *by_enclosed_kpa, double *by_share, double *by_pressure,
-                double *by_answering) {
+                double *by_enclosed_kpa, double *by_share, double *by_pressure) {
   Sizes *contact = malloc(sizeof(Sizes) * (count + 1));
   Press *pressed = malloc(sizeof(Press) * (count + 1));
   int64_t *of = malloc(sizeof(int64_t) * (2 * count + 1)), *is_free = of + count;
@@ -936,11 +911,11 @@ int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, co
   }
   size_t size = sizeof(double) * n * parameters;
   memset(by_enclosed, 0, size), memset(by_enclosed_kpa, 0, size);
-  memset(by_share, 0, size), memset(by_pressure, 0, size), memset(by_answering, 0, size);
+  memset(by_share, 0, size), memset(by_pressure, 0, size);
   for (int64_t i = 0; i < n; i++) {
     int there = 0;
     double of_as_is = 0.0, as_is = 0.0, of_drawn = 0.0, drawn = 0.0, stronger = 0.0;
-    double answer = 0.0, no_share = 1.0;
+    double no_share = 1.0;
     for (int64_t k = 0; k < count; k++) {
       int is_ring = each[COLUMNS * k + HOLE] != 0 || index[COLUMNS * k + HOLE] >= 0;
       Press *p = pressed + there;
@@ -949,11 +924,10 @@ int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, co
       of_as_is += within, as_is += within * p->as_is.pressure;
       of_drawn += p->drawn.share, drawn += p->drawn.share * p->drawn.pressure;
       stronger += p->drawn.share * contact[k].stronger, no_share *= 1 - p->drawn.share;
-      answer += p->drawn.share * contact[k].answer;
       of[there++] = k;
     }
     of_as_is = fmax(of_as_is, 1e-12), as_is /= of_as_is;
-    of_drawn = fmax(of_drawn, 1e-12), drawn /= of_drawn, stronger /= of_drawn, answer /= of_drawn;
+    of_drawn = fmax(of_drawn, 1e-12), drawn /= of_drawn, stronger /= of_drawn;
     for (int j = 0; j < there; j++) {
       if (!is_free[of[j]]) continue;
       const Press *p = pressed + j;
@@ -977,19 +951,16 @@ int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, co
       for (int q = 0; q < COLUMNS; q++) {
         if (places[q] < 0) continue;
         int64_t at = i * parameters + places[q];
-        double own_share = (1 - no_share) / of_drawn, others = share[q] * others_share;
-        double strength = share[q] * (sizes->stronger - stronger) +
-                          sizes->stronger_by[q] * p->drawn.share;
-        double answers = share[q] * (sizes->answer - answer) +
-                         sizes->answer_by[q] * p->drawn.share;
+        double by = q == SIZE ? sizes->by_size : q == EDGE ? sizes->by_edge : 0.0;
+        double strength = share[q] * (sizes->stronger - stronger) -
+                          2 * by * sizes->stronger * p->drawn.share;
         double enclosed = q < f->forms ? by_wide * p->as_is.outline.by_t[q] : 0.0;
         double within = enclosed * p->as_is.left + p->enclosed * left[q];
         by_enclosed[at] = enclosed * others_wide;
         by_enclosed_kpa[at] = (within * (p->as_is.pressure - as_is) +
                                p->enclosed * p->as_is.left * own[q]) /
                               of_as_is;
-        by_share[at] = others * stronger + own_share * strength;
-        by_answering[at] = others * answer + own_share * answers;
+        by_share[at] = share[q] * others_share * stronger + (1 - no_share) * strength / of_drawn;
         by_pressure[at] =
             (share[q] * (p->drawn.pressure - drawn) + kpa[q] * p->drawn.share) / of_drawn;
       }

@@ -30,8 +30,8 @@ _ARGUMENTS = {
     "differentiate": [_ARRAY, _ARRAY, _COUNT, *[_ARRAY] * 3, _COUNT, *[_ARRAY] * 3],
     "columns_of": [_ARRAY, _ARRAY, _COUNT, _COUNT, _ARRAY, _ARRAY],
     "conduct": [_ARRAY, _COUNT, _ARRAY, _ARRAY, ctypes.c_double, _ARRAY, _ARRAY],
-    "draw": [_ARRAY, _COUNT, _ARRAY, _COUNT, *[_ARRAY] * 8],
-    "draw_slopes": [_ARRAY, _COUNT, _ARRAY, _COUNT, *[_ARRAY] * 3, _COUNT, *[_ARRAY] * 5],
+    "draw": [_ARRAY, _COUNT, _ARRAY, _COUNT, *[_ARRAY] * 7],
+    "draw_slopes": [_ARRAY, _COUNT, _ARRAY, _COUNT, *[_ARRAY] * 3, _COUNT, *[_ARRAY] * 4],
 }
 
 

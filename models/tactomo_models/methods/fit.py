@@ -186,7 +186,7 @@ class Fit:
         if not companions:  # in every frame of most sensors
             return {}
         drawing = belief.account.fitted.drawing
-        by_share, by_pressure = drawing.slopes()[2:4]
+        by_share, by_pressure = drawing.slopes()[2:]
         share, pressure = drawing.share, drawing.pressure_kpa
         covariance = np.linalg.inv(belief.account.hessian)[:-1, :-1]
         forces = {}

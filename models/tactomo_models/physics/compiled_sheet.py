@@ -88,7 +88,6 @@ class CompiledResponse:
         self._kept = [np.ascontiguousarray(each, np.float64) for each in (pressure_kpa, value)]
         self._response = _Response(saturates, len(value), *map(address, self._kept))
         self.address = ctypes.byref(self._response)  # for C
-        self.place = ctypes.addressof(self._response)  # for C's structures
 
     def conductivity(
         self, share: FloatArray, pressure_kpa: FloatArray, log_ratio: float

@@ -12,7 +12,7 @@ from tactomo_models.arrays import FloatArray, IntArray
 
 GRADED_WIDTH = 0.7
 
-Slopes: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+Slopes: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True)
@@ -28,9 +28,7 @@ class Drawing:
     # the mesh's blur
     share: FloatArray
     pressure_kpa: FloatArray  # (n,) pressure on that share
-    # (n,) share with which a graded sheet answers: larger where it changes much
-    answering: FloatArray
-    slopes: Callable[[], Slopes]  # makes the derivatives (n, N) of the five by the parameters
+    slopes: Callable[[], Slopes]  # makes the derivatives (n, N) of the four by the parameters
 
 
 def heaviside(t: FloatArray) -> FloatArray:

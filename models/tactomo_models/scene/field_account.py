@@ -331,7 +331,7 @@ class FieldAccountant:
         J = self._sensed(fitted, measured)
         with_ratio = self._covariance(fitted, measured, J)
         covariance = with_ratio[:-1, :-1]
-        by_share, by_pressure = drawing.slopes()[2:4]
+        by_share, by_pressure = drawing.slopes()[2:]
         cell = self._areas.node_areas_m2[drawing.nodes]
         share, pressure = drawing.share, drawing.pressure_kpa
 

@@ -225,7 +225,7 @@ class FieldFit:
     def _pressed(self, name: Channel, drawing: Drawing, log_ratio: float) -> Pressed:
         """What presses on a sheet, as the sheet sees it."""
         response = self.responses[name]
-        share, pressure = drawing.answering, drawing.pressure_kpa
+        share, pressure = drawing.share, drawing.pressure_kpa
         if name == Channel.STRUCTURE:
             share, pressure = drawing.enclosed, drawing.enclosed_kpa
         rises = response.rises(log_ratio)
@@ -291,9 +291,7 @@ class FieldFit:
         slopes = drawing.slopes()
         sheets = []
         for name, changes in measured.items():
-            by_share, by_pressure = (
-                slopes[:2] if name == Channel.STRUCTURE else (slopes[4], slopes[3])
-            )
+            by_share, by_pressure = slopes[:2] if name == Channel.STRUCTURE else slopes[2:]
             by_parameter = self.sheet(name).slopes(
                 fitted.solutions[name],
                 self._pressed(name, drawing, fitted.log_ratio),
@@ -349,9 +347,7 @@ class FieldFit:
                 after = np.ones(len(nodes))
                 after[at] = conducting
                 slopes = other.slopes()
-                by_share, by_pressure = (
-                    slopes[:2] if name == Channel.STRUCTURE else (slopes[4], slopes[3])
-                )
+                by_share, by_pressure = slopes[:2] if name == Channel.STRUCTURE else slopes[2:]
                 factor = 2 * before / (before + after)
                 into[:, 0] = factor * (after - before)
                 into[at, 1:-1] = by[0][:, None] * by_share + by[1][:, None] * by_pressure
@@ -482,7 +478,7 @@ def _felt_slopes(weights: FloatArray, drawing: Drawing) -> FloatArray:
 
     The log ratio leaves it as it is: the field is the same, whatever a sheet makes of it.
     """
-    by_share, by_pressure = drawing.slopes()[2:4]
+    _, _, by_share, by_pressure = drawing.slopes()
     by_pressed = by_share.T * drawing.pressure_kpa + by_pressure.T * drawing.share
     felt = weights[:, drawing.nodes] @ by_pressed.T
     return np.column_stack([felt, np.zeros(len(felt))])

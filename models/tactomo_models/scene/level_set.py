@@ -102,9 +102,9 @@ class LevelSet:
             if self._field is not None:
                 owner = kernels + self._owner[nodes]
                 by_pressure[np.arange(len(nodes)), owner] = self._field.unit_kpa
-            return by_share, by_pressure, by_share, by_pressure, by_share
+            return by_share, by_pressure, by_share, by_pressure
 
-        return Drawing(nodes, share[nodes], pressure, share[nodes], pressure, share[nodes], slopes)
+        return Drawing(nodes, share[nodes], pressure, share[nodes], pressure, slopes)
 
 
 def _kernel_centres(half_side_m: float) -> tuple[FloatArray, float]:

@@ -16,20 +16,14 @@ Where contacts overlap, what is pressed is pressed once, with the mean of their 
 A mesh blurs what is drawn on its nodes. Of a blurred disc of radius r voltages see the area, and
 along each axis a second moment of r^2 / 4 + b, b the variance of the blur: it looks larger and
 fainter. On a graded sheet a contact is drawn smaller and stronger, of radius k r and with a share
-of h / k^2, so that both are those of the contact; the sheet answers with a share of a h:
+of h / k^2, so that both are those of the contact:
 
     k^2 = 1 - 2 (gamma + 2) b / r^2     r^2 / (2 gamma + 4) is the moment of a pressure that falls
-    1 / a = 1 - 2 (gamma + 2) b sqrt(c) / r^2     c its ratio of conductivities where the pressure
-                                        is P (gamma + 1) / (2 gamma + 1), its mean by itself
-
-Where c is nearly 1 the two shares are one. A strong contrast at a blurred edge needs more: sqrt(c)
-is what the equation of the sheet around a blurred disc asks, solved ring by ring from c = 0.75 to
-3, to 4 %.
 """
 
 from __future__ import annotations
 
-from ctypes import Structure, byref, c_double, c_int64, c_void_p
+from ctypes import Structure, byref, c_double, c_int64
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 
@@ -69,7 +63,6 @@ class _Field(Structure):
     _fields_ = (
         *((name, c_double) for name in ("half_width_m", "offset_m", "unit_kpa", "blur_m2")),
         *((name, c_int64) for name in ("forms", "is_sharp")),
-        ("graded", c_void_p),
     )
 
 
@@ -88,7 +81,6 @@ class PressureField:
     # peak that a contact starts with, in that unit: the middle of what the table answers to
     typical_peak: float
     size_limits: tuple[float, float]  # least and largest logarithm of the mean radius in metres
-    graded: GradedResponse | None  # the magnitude sheet's response; None where there is none
     fills_box: bool = True  # whether the nodes lie all over their bounding box
     # (K, COLUMNS) parameters of each contact, as far as they are not fitted
     fixed: FloatArray = field(default_factory=lambda: np.zeros((0, COLUMNS)))
@@ -122,9 +114,7 @@ class PressureField:
         spacing = description.width_m / (description.map.nodes_x - 1)
         end_kpa = graded.end_kpa if graded else 300.0
         onset = graded.onset_kpa / end_kpa if graded else 0.0
-        # Two triangles to a node: half of the sheet is in larger ones, whatever is along its rim.
-        areas_m2 = np.sort(forward.triangle_areas_m2)
-        node_m2 = 2 * float(areas_m2[areas_m2.cumsum().searchsorted(areas_m2.sum() / 2)])
+        node_m2 = float(forward.node_areas_m2.mean())
         blur_m2 = of_triangles * node_m2 + of_step * (GRADED_WIDTH * spacing) ** 2
         largest = float(np.log(np.hypot(description.width_m, description.height_m) / 2))
         return cls(
@@ -138,7 +128,6 @@ class PressureField:
             onset=onset,
             typical_peak=(onset + 1) / 2,
             size_limits=(SMALLEST_SIZE, largest),
-            graded=graded,
             fills_box=description.sheet.shape == "rectangle",
         )
 
@@ -252,7 +241,7 @@ class PressureField:
         each = self.split(parameters)
         of = byref(self._for_c())
         points = len(self.x_m)
-        nodes, found = np.empty(points, np.intp), np.empty((5, points))
+        nodes, found = np.empty(points, np.intp), np.empty((4, points))
         places = at(self.x_m), at(self.y_m)
         count = LIBRARY.draw(of, len(each), at(each), points, *places, at(nodes), *_rows(found))
         nodes = nodes[:count].copy()
@@ -260,22 +249,20 @@ class PressureField:
         @cache
         def slopes() -> Slopes:
             x_m, y_m = self.x_m[nodes], self.y_m[nodes]
-            by = np.empty((5, count, self.index.max(initial=-1) + 1))
+            by = np.empty((4, count, self.index.max(initial=-1) + 1))
             points = count, at(x_m), at(y_m)
             LIBRARY.draw_slopes(
                 of, len(each), at(each), *points, at(self.index), by.shape[2], *_rows(by)
             )
-            return by[0], by[1], by[2], by[3], by[4]
+            return by[0], by[1], by[2], by[3]
 
-        enclosed, enclosed_kpa, share, pressure, answering = found[:, :count].copy()
-        return Drawing(nodes, enclosed, enclosed_kpa, share, pressure, answering, slopes)
+        enclosed, enclosed_kpa, share, pressure = found[:, :count].copy()
+        return Drawing(nodes, enclosed, enclosed_kpa, share, pressure, slopes)
 
     def _for_c(self, step_m: float | None = None) -> _Field:
         """For C; as sharp as points a step apart can show it, where there is one."""
         width, blur = (self.half_width_m, self.blur_m2) if step_m is None else (step_m, 0.0)
-        graded = None if self.graded is None else self.graded.compiled.place
-        sharp = step_m is not None
-        return _Field(width, self.offset_m, self.unit_kpa, blur, self.forms, sharp, graded)
+        return _Field(width, self.offset_m, self.unit_kpa, blur, self.forms, step_m is not None)
 
     def sampled(
         self, each: FloatArray, x_m: FloatArray, y_m: FloatArray, step_m: float
@@ -284,7 +271,7 @@ class PressureField:
 
         Outlines are as sharp as the points can show them.
         """
-        found = np.empty((5, len(x_m)))
+        found = np.empty((4, len(x_m)))
         places = len(x_m), at(x_m), at(y_m)
         of = byref(self._for_c(step_m))
         LIBRARY.draw(of, len(each), at(each), *places, None, *_rows(found))

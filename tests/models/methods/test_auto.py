@@ -217,7 +217,7 @@ def test_a_drift_that_was_learnt_outlives_the_touch(
     auto.set_reference(skin.reference(19))
     assert "drifted" in auto.reconstruct(**drifted).reason
     assert auto.reconstruct(**skin.scan()).tier == "quiet"
-    budget_s, auto.budget_s = auto.budget_s, 0.03  # too little to find it out again
+    budget_s, auto.budget_s = auto.budget_s, 0.02  # too little to find it out again
     frame = auto.reconstruct(**drifted)
     auto.reset()
     assert "drifted" not in auto.reconstruct(**drifted).reason

@@ -41,7 +41,7 @@ def sensor() -> SensorDescription:
 
 @pytest.fixture(scope="module")
 def skin(sensor: SensorDescription) -> Skin:
-    return Skin(SkinSimulator(sensor, spacing_m=0.0012))
+    return Skin(SkinSimulator(sensor, spacing_m=0.0022))
 
 
 @pytest.fixture(scope="module")

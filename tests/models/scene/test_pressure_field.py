@@ -61,12 +61,11 @@ def field(forward: ForwardModel, small: SensorDescription) -> PressureField:
 
 
 def on_nodes(drawing: Drawing, count: int, unit_kpa: float) -> FloatArray:
-    """What each sheet sees pressed, and the pressure on that in the field's unit: (5, P)."""
-    values = np.zeros((5, count))
+    """What each sheet sees pressed, and the pressure on that in the field's unit: (4, P)."""
+    values = np.zeros((4, count))
     enclosed = drawing.enclosed * drawing.enclosed_kpa / unit_kpa
     pressed = drawing.share * drawing.pressure_kpa / unit_kpa
-    seen = drawing.enclosed, enclosed, drawing.share, pressed, drawing.answering
-    values[:, drawing.nodes] = seen
+    values[:, drawing.nodes] = drawing.enclosed, enclosed, drawing.share, pressed
     return values
 
 
@@ -74,11 +73,11 @@ def slope_on_nodes(
     drawing: Drawing, direction: FloatArray, count: int, unit_kpa: float
 ) -> FloatArray:
     """Derivative of the same along a direction of the parameters."""
-    wide, wide_kpa, share, pressure, answer = (each @ direction for each in drawing.slopes())
-    slope = np.zeros((5, count))
+    wide, wide_kpa, share, pressure = (each @ direction for each in drawing.slopes())
+    slope = np.zeros((4, count))
     enclosed = wide * drawing.enclosed_kpa + drawing.enclosed * wide_kpa
     pressed = share * drawing.pressure_kpa + drawing.share * pressure
-    slope[:, drawing.nodes] = wide, enclosed / unit_kpa, share, pressed / unit_kpa, answer
+    slope[:, drawing.nodes] = wide, enclosed / unit_kpa, share, pressed / unit_kpa
     return slope
 
 
