@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from tactomo_client.connection import Connection
 
 CHANGES = "dv"
-ANY_RING = "tank_disc"  # takes any pattern, while a file of a sheet is read that nobody has described
+ANY_RING = "tank_disc"  # takes any pattern: stands for a sheet that nobody has described
 
 
 class DoctorError(TactomoError):
