@@ -49,7 +49,7 @@ def test_a_description_is_drawn_built_pressed_and_judged(newcomer: Newcomer) -> 
         seen = newcomer.wait_for(watch, " mm ")
         x_mm, y_mm = re.findall(r"\(([+-][\d.]+), ([+-][\d.]+)\) mm", seen)[-1]
         assert (float(x_mm), float(y_mm)) == pytest.approx((30, 20), abs=2)
-        newcomer.wait_for(status, f"\n{'tier':<16} fit\n")
+        assert "auto; the newest frame by fit" in newcomer.wait_for(status, "newest frame by fit")
         newcomer.run(release)
         newcomer.stop()
         (judged,) = newcomer.follow(PAGE.commands("5"))

@@ -20,7 +20,7 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.bare_sheet import scan_voltages
 from tactomo_models.sensor.description_file import shipped_text
 from tactomo_models.sensor.named_pattern import NamedPattern
-from tactomo_models.sensor.pattern import reciprocal_pairs
+from tactomo_models.sensor.pattern import reciprocal_pairs, scan_pairs
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
 from waiting import PATIENCE_S, wait_until
 from whole_system import SENSOR, Demo, running_demo
@@ -79,7 +79,7 @@ def test_what_one_scan_does_not_tell_is_null(tactomo: Run, rest: FloatArray) -> 
     np.savez("in.npz", rest=rest[None])
     outcome = tactomo("doctor", "in.npz", "--json")
     assert "NaN" not in outcome.stdout
-    assert set(report(outcome)["channels"]["structure"]["snr_db"]) == {None}
+    assert set(report(outcome)["channels"]["rest"]["snr_db"]) == {None}
 
 
 def test_a_table_names_the_electrode(
@@ -98,6 +98,21 @@ def test_a_table_names_the_electrode(
     assert "ill: follow the next steps" in outcome.stdout
 
 
+def every_pair(electrodes: int, volts: FloatArray) -> FloatArray:
+    """Scans of adjacent pairs as every drive by every measuring pair, zero where it cannot be."""
+    pairs = scan_pairs(electrodes)
+    full = np.zeros((len(volts), electrodes, electrodes))
+    full[:, pairs.drive[:, 0], pairs.measure[:, 0]] = volts
+    return full.reshape(len(volts), -1)
+
+
+def test_an_unknown_device_is_read_by_its_zeros(tactomo: Run, rest: FloatArray) -> None:
+    np.savez("in.npz", baseline=every_pair(16, np.abs(noisy(rest))), dv=np.zeros((3, 256)))
+    outcome = tactomo("doctor", "in.npz", "--json")
+    assert outcome.returncode == 0, outcome.stdout
+    assert "read as 16:adjacent" in " ".join(report(outcome)["notes"])
+
+
 def test_voltages_in_no_order_are_a_broken_device(tactomo: Run, rest: FloatArray) -> None:
     mixed = np.random.default_rng(0).permutation(rest)
     np.savez("in.npz", mine=noisy(mixed))
@@ -109,11 +124,12 @@ def test_voltages_in_no_order_are_a_broken_device(tactomo: Run, rest: FloatArray
 def test_a_pattern_says_the_order(tactomo: Run, rest: FloatArray) -> None:
     rotated = NamedPattern.of_name("16:adjacent:rotated")
     np.savez("in.npz", empty=noisy(rest)[:, np.argsort(rotated.order)])
-    outcome = tactomo("doctor", "in.npz", "--pattern", str(rotated), "--json")
-    assert outcome.returncode == 0, outcome.stdout
-    assert f"read as {rotated}" in " ".join(report(outcome)["notes"])
-    (found,) = report(outcome)["channels"].values()
-    assert about(found["findings"], "reciprocity")["level"] == "ok"
+    for more in ([], ["--pattern", str(rotated)]):
+        outcome = tactomo("doctor", "in.npz", *more, "--json")
+        assert outcome.returncode == 0, outcome.stdout
+        assert f"read as {rotated}" in " ".join(report(outcome)["notes"])
+        (found,) = report(outcome)["channels"].values()
+        assert about(found["findings"], "reciprocity")["level"] == "ok"
 
 
 def test_complex_scans_are_turned(tactomo: Run, rest: FloatArray) -> None:
@@ -128,8 +144,9 @@ def test_complex_scans_are_turned(tactomo: Run, rest: FloatArray) -> None:
     [
         ({"dv": (5, 208)}, [], "holds changes of voltages"),
         ({"other": (5, 208)}, [], "name the array of scans at rest with --array"),
-        ({"rest": (5, 7)}, [], "no scans of 208 voltages, as of paper_square"),
-        ({"rest": (5, 208)}, ["--array", "mine"], "no numbers called 'mine'"),
+        ({"rest": (5, 7)}, [], "give --description or --pattern"),
+        ({"rest": (5, 256)}, [], "256 voltages a scan, which fit no pattern"),
+        ({"rest": (5, 208)}, ["--array", "mine"], "there is no array 'mine'"),
         ({"rest": (5, 208)}, ["--pattern", "16:round"], "'16:round' is no pattern"),
         ({"rest": (5, 208)}, ["--frames", "7:9"], "give other --frames"),
     ],
@@ -191,7 +208,7 @@ def test_of_a_slow_device_more_scans_are_asked_for(tactomo: Run, rest: FloatArra
 def test_scans_without_times_say_nothing_of_drift(tactomo: Run, rest: FloatArray) -> None:
     np.savez("in.npz", rest=noisy(rest))
     drift = about(
-        report(tactomo("doctor", "in.npz", "--json"))["channels"]["structure"]["findings"], "drift"
+        report(tactomo("doctor", "in.npz", "--json"))["channels"]["rest"]["findings"], "drift"
     )
     assert drift["detail"] == "not known: nobody says when scans were taken"
     assert "with their times" in drift["next_step"]
@@ -241,16 +258,15 @@ def test_one_lost_scan_is_no_rate_of_loss(
 
 
 def test_the_broken_device_is_called_broken(tactomo: Run) -> None:
-    outcome = tactomo("doctor", measured("skin_bad_device_32el.npz"), "--pattern", "32:adjacent")
+    outcome = tactomo("doctor", measured("skin_bad_device_32el.npz"))
     assert outcome.returncode == 1
     assert "broken" in outcome.stdout
     assert "67.8%" in outcome.stdout
 
 
-@pytest.mark.parametrize("arguments", [[], ["--frames", "0:20"]])
+@pytest.mark.parametrize("arguments", [[], ["-d", "tank_disc"], ["--frames", "0:20"]])
 def test_the_tank_is_not(tactomo: Run, arguments: list[str]) -> None:
-    file = measured("tank_sciospec_20fps.npz")
-    outcome = tactomo("doctor", file, "-d", "tank_disc", *arguments, "--json")
+    outcome = tactomo("doctor", measured("tank_sciospec_20fps.npz"), *arguments, "--json")
     assert outcome.returncode == 0
     assert report(outcome)["verdict"] == "healthy"
 

@@ -290,7 +290,7 @@ def test_any_pattern_is_applied_or_refused_by_name(name: str) -> None:
 
 def test_doctor_examines_them_too(tactomo: Run, tmp_path: Path) -> None:
     (tmp_path / "rest.csv").write_text(text(np.vstack([tank()[0]] * 5)))
-    result = tactomo("doctor", tmp_path / "rest.csv", "-d", "tank_disc")
+    result = tactomo("doctor", tmp_path / "rest.csv")
     assert result.returncode == 0, result.stdout
     assert "healthy" in result.stdout
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -33,8 +34,8 @@ def test_a_press_is_found_in_a_file(tactomo: Run, tmp_path: Path) -> None:
     np.savez(tmp_path / "in.npz", **scans, **references)  # type: ignore[arg-type]
     result = tactomo("reconstruct", "in.npz", "out.npz")
     assert result.returncode == 0
-    told = "wrote out.npz: 2 frames\nno frame is flagged\n1 contact in all frames together\n"
-    assert told in result.stdout
+    assert "wrote out.npz: 2 frames\nno frame is flagged\n" in result.stdout
+    assert re.search(r"1 +-30\.\d +\d\d\.\d .* 18\d ± \d kPa", result.stdout)
     with np.load(tmp_path / "out.npz") as maps:
         assert maps["map"].shape == (2, 51, 51)
         assert maps["contact_frame"].tolist() == [1]
@@ -209,7 +210,20 @@ def test_flags_are_told_in_words(tactomo: Run, tmp_path: Path) -> None:
     assert result.returncode == 0
     flagged = "2 of 2 frames are flagged structure_missing: no scans of the structure channel\n"
     assert flagged in result.stdout
-    assert "0 contacts in all frames together" in result.stdout
+    assert "no contact is found" in result.stdout
+
+
+@pytest.mark.parametrize("methods", [("tikhonov,noser",), ("tikhonov", "noser")])
+def test_methods_are_drawn_side_by_side(
+    tactomo: Run, tmp_path: Path, methods: tuple[str, ...]
+) -> None:
+    scans_file(tmp_path / "in.npz")
+    named = [word for name in methods for word in ("--method", name)]
+    result = tactomo("reconstruct", "in.npz", "out.npz", *named, "--picture", "maps.svg")
+    assert result.returncode == 0, result.stderr
+    assert "wrote maps.svg" in result.stdout
+    drawn = (tmp_path / "maps.svg").read_text("utf-8")
+    assert all(f"{name}, frame 1" in drawn for name in ("tikhonov", "noser"))
 
 
 def test_only_its_own_output_is_written_over_unasked(tactomo: Run, tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ app = options.typer_app()
         "tactomo doctor -s left_forearm --seconds 30",
         "tactomo doctor grasp.mcap --frames 0:100",
         "tactomo doctor tank.npz -d tank_disc",
-        "tactomo doctor new_device.npz --array baseline --pattern 32:adjacent --json",
+        "tactomo doctor new_device.npz --array baseline --json",
     )
 )
 def doctor(
@@ -59,7 +59,7 @@ def doctor(
             "--description",
             "-d",
             help="Sensor description: a shipped name or a TOML file. [the daemon's, the "
-            f"recording's; of other files {options.DEFAULT_DESCRIPTION}]",
+            "recording's; of other files the pattern alone]",
         ),
     ] = None,
     frames: Annotated[
@@ -71,7 +71,7 @@ def doctor(
     ] = None,
     pattern: Annotated[
         str | None,
-        typer.Option(help="Pattern of a file's voltages: 16:adjacent. [the description's]"),
+        typer.Option(help="Pattern of a file's voltages: 16:adjacent. [the one that fits]"),
     ] = None,
     as_json: options.JsonOutput = False,
     keys: options.KeysFolder = None,
@@ -90,8 +90,9 @@ def doctor(
     *swapped* (two leads changed places; needs a description).
 
     `tactomo doctor` reads files as `tactomo reconstruct` does. `--array` names scans at rest, (T,
-    voltages); without it, an array called reference, baseline, rest, empty or vh is taken. Of a
-    sheet that nobody has described, `--pattern` gives the order of the voltages.
+    voltages); without it, an array called reference, baseline, rest, empty or vh is taken. Without
+    a description, `--pattern` gives the order of the voltages, or the command takes the pattern
+    that fits the zeros or the reciprocity. The report says how the file was read.
     """
     chosen = options.frame_slice(frames)
     if what is not None and what.suffix.lower() == ".mcap":

@@ -13,17 +13,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from tactomo_client import Keys
 from tactomo_client.schema import STALE_AFTER_S
 from tactomo_models import DescriptionError, load_description
 from tactomo_models.array_files import NUMBERS
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scans.plausibility import Layout
-from tactomo_models.sensor.named_pattern import NamedPattern
+from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
 from tactomo_models.sensor.pattern import PatternLayout, scan_pairs
 from tactomo_protocol import SCAN_COUNTERS, Channel, Hello, Scan, ScanFlag
 
-from tactomo.cli.options import DEFAULT_DESCRIPTION
 from tactomo.errors import TactomoError
 from tactomo.recordings.imported_scans import (
     AT_REST,
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from tactomo_client.connection import Connection
 
 CHANGES = "dv"
-ANY_RING = "tank_disc"  # takes any pattern: stands for a sheet that nobody has described
+ANY_RING = "tank_disc"  # stands for a sheet that nobody has described, while its file is read
 
 
 class DoctorError(TactomoError):
@@ -252,40 +252,48 @@ def _heard_on_ports(recording: Recording, ports: list[list[_Taken]]) -> Heard:
 
 def of_arrays(
     path: Path,  # the file
-    description: str | None,  # of the sensor that was measured; by default the paper's
+    # of the sensor that was measured; its pattern alone is worked out if None
+    description: str | None,
     # name of the array of scans at rest, where the layout is neither of import's
     array: str | None,
-    pattern: str | None,  # the order of its voltages; by default the description's
+    pattern: str | None,  # the order of its voltages; the description's, or what fits, if None
     frames: slice | None,  # which scans; all if None
 ) -> Evidence:
     """Read a file of arrays as `tactomo reconstruct` does; see `tactomo doctor --help`.
 
     Raises DoctorError, ImportFileError, EitFileError or DataError where it cannot be read or
-    examined, or its scans do not fit the description or pattern.
+    examined, or its scans fit no description or pattern.
     """
-    if array is None:
-        array = _at_rest(path)
+    arrays = load_arrays(path)
+    is_batch = array is None and bool(arrays.keys() & set(Channel))
+    if array is None and not (is_batch or is_single_ended(arrays)):
+        array = _at_rest(path, arrays)
     named = None if pattern is None else NamedPattern.of_name(pattern)
-    sensor = load_description(description or (ANY_RING if named else DEFAULT_DESCRIPTION))
-    sensor = sensor if named is None else named.applied(sensor)
-    layout: Layout = sensor
-    how = f"read as scans of {sensor.name}"
-    if named is not None and description is None:
-        layout, how = named.layout, f"read as {named}; no description of the sheet"
+    layout: Layout
+    names: tuple[str, ...]
+    if description is not None or is_batch:
+        sensor = load_description(description or "paper_square")
+        layout = sensor = sensor if named is None else named.applied(sensor)
+        names, how = sensor.channels, f"read as scans of {sensor.name}"
+    else:
+        named = named or _fitting_pattern(path, arrays, array)
+        sensor, layout = named.applied(load_description(ANY_RING)), named.layout
+        names, how = (array or "volts",), f"read as {named}; no description of the sheet"
+    del arrays  # else all scans are in memory twice
     read = read_scans(path, sensor, sensor.channels[-1], array=array, pattern=named)
     which = frames or slice(None)
     times_s = None if read.time_s is None else read.time_s[which]
-    if not len(range(read.count)[which]):
-        raise DoctorError(f"{path} has {read.count} scans, none of these", "give other --frames")
-    scans = {str(name): Scans(volts[which], times_s) for name, volts in read.volts.items()}
+    scans = {}
+    for channel, volts in read.volts.items():
+        if not len(volts[which]):
+            raise DoctorError(
+                f"{path} has {len(volts)} scans, none of these", "give other --frames"
+            )
+        scans[channel if channel in names else names[0]] = Scans(volts[which], times_s)
     return Evidence(str(path), layout, scans, notes=(how, *read.notes))
 
 
-def _at_rest(path: Path) -> str | None:
-    """Return the name of the scans at rest; None for a layout that says itself what is what."""
-    arrays = load_arrays(path)
-    if arrays.keys() & set(Channel) or is_single_ended(arrays):
-        return None
+def _at_rest(path: Path, arrays: Mapping[str, NDArray[Any]]) -> str:
     name = next((known for known in (*AT_REST, NUMBERS) if known in arrays), None)
     if name is not None:
         return name
@@ -297,3 +305,31 @@ def _at_rest(path: Path) -> str | None:
         )
     held = ", ".join(arrays) or "nothing"
     raise DoctorError(f"{path} holds {held}", "name the array of scans at rest with --array")
+
+
+def _fitting_pattern(
+    path: Path, arrays: Mapping[str, NDArray[Any]], array: str | None
+) -> NamedPattern:
+    """Work out the pattern of scans whose sheet nobody has described."""
+    if array is None:  # of single-ended readings, by where the current went
+        injection, electrodes = arrays["injection"].astype(int), arrays["volts"].shape[-1]
+        offsets = (injection[:, 1] - injection[:, 0]) % electrodes
+        offset = int(np.median(np.minimum(offsets, electrodes - offsets)))
+        return NamedPattern(electrodes, max(1, offset), 1)
+    if array not in arrays:
+        raise DoctorError(f"{path} holds {', '.join(arrays)}", f"there is no array {array!r}")
+    raw = np.atleast_2d(arrays[array])
+    if raw.ndim != 2 or raw.dtype.kind not in "fiuc" or raw.size == 0:
+        raise DoctorError(
+            f"{path}: {array} is {raw.dtype} {raw.shape}", "it must be numbers, (T, voltages)"
+        )
+    count = raw.shape[1]
+    electrodes = round((3 + np.sqrt(9 + 4 * count)) / 2)
+    adjacent = [NamedPattern(electrodes, 1, 1)] * (electrodes * (electrodes - 3) == count)
+    found = [*fitting_patterns(np.abs(raw) if raw.dtype.kind == "c" else raw), *adjacent]
+    if not found:
+        raise DoctorError(
+            f"{path}: {array} has {count} voltages a scan, which fit no pattern",
+            "give --description or --pattern, such as 16:opposite:adjacent",
+        )
+    return found[0]

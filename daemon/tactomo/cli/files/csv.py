@@ -27,6 +27,8 @@ FRAME_COLUMNS: Final = (
     "age_s",
 )
 CONTACT_COLUMNS: Final = tuple(table_row(Contact(0, 0.0, 0.0, 0.0)))
+ARRAY_COLUMNS: Final = {"magnitude_sigma": "contact_sigma", "frame": "contact_mount_frame"}
+"""Columns whose array in the .npz of `tactomo reconstruct` is not named `contact_` and theirs."""
 
 
 def write_contacts(moments: Iterable[Moment], output: IO[bytes]) -> int:

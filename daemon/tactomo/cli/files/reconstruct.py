@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+import tempfile
 from pathlib import Path
 from typing import Annotated
 
@@ -13,14 +13,14 @@ from tactomo.cli.options import (
     Description,
     Force,
     GivenChannel,
-    Method,
     ReferenceFrames,
     examples,
     frame_slice,
+    methods_option,
     typer_app,
 )
 from tactomo.cli.output import progress_bar, say
-from tactomo.cli.plot.plot import prepare_file
+from tactomo.cli.plot.plot import picture_option, prepare_file, save_figure
 from tactomo.plain import counted
 
 app = typer_app()
@@ -30,6 +30,7 @@ app = typer_app()
     epilog=examples(
         "tactomo reconstruct scans.npz maps.npz",
         "tactomo reconstruct scans.npz maps.npz --method tikhonov -d my_skin.toml",
+        "tactomo reconstruct scans.npz maps.npz --method fit,noser --picture maps.png",
         "tactomo reconstruct tank.mat maps.npz -d tank_disc --reference-frames 0:20",
         "tactomo reconstruct a.csv a.npz -d tank_disc --reference b.csv --pattern 32:1",
     ),
@@ -39,7 +40,7 @@ def reconstruct(
         Path, typer.Argument(metavar="IN", help="Scans: .npz, .mat, .csv, .txt, .eit.")
     ],
     maps: Annotated[Path, typer.Argument(metavar="OUT.npz", help="The file to write.")],
-    method: Method = "auto",
+    method: Annotated[list[str] | None, methods_option(" [auto]")] = None,
     description: Description = DEFAULT_DESCRIPTION,
     calibration: Annotated[
         Path | None,
@@ -63,6 +64,9 @@ def reconstruct(
         str | None, typer.Option(help="Name of the array of scans in IN. [the one that fits]")
     ] = None,
     channel: GivenChannel = None,
+    picture: Annotated[
+        Path | None, picture_option("Draw the frames that tell most, a row for each method")
+    ] = None,
     force: Force = False,
 ) -> None:
     """Reconstruct a file of scans, without a daemon.
@@ -99,7 +103,8 @@ def reconstruct(
     alone. *auto* is *fit*; where the sensor has a network, the network proposes the start of the
     fit, and makes the map where no fit explains the scans. Where objects conduct `either_way`,
     *fit* and *auto* are *noser*. The laboratory adds *pls-paper*, the level set of the paper that
-    tactomo is compared with, and the paper's networks, *cnn-single* and *cnn-multimodal*.
+    tactomo is compared with, and the paper's networks, *cnn-single* and *cnn-multimodal*. Of
+    several methods, OUT holds the maps of the first; the picture shows all.
     """
     from tactomo_models import load_description
     from tactomo_models.batch import ReferencedScans, reconstruct_file, reference_at_rest
@@ -135,47 +140,44 @@ def reconstruct(
         reference = reference.with_noise_of(sensor, *map(given.get, Channel))
     for note in read.notes:
         say(note, err=True)
-    with progress_bar(f"reconstructing by {method}") as show:
-        made = reconstruct_file(
-            scans,
-            maps,
-            read=ReferencedScans(given, reference, read.companions),
-            description=sensor,
-            method=method,
-            progress=show,
-            curve=curve,
-            taught=lesson,
-        )
-    if made.failed:
-        frames = counted(made.failed, "frame")
-        say(f"{made.failure}; instead, tikhonov made {frames}", err=True)
-    say(f"wrote {maps}: {made.frames} frames")
-    if made.repeated:
-        say(
-            f"left out: {counted(made.repeated, 'scan')} that repeat earlier ones, though "
-            "scans at rest have noise; either the converter is frozen, or the file holds "
-            "frames twice",
-            err=True,
-        )
-    if maps.is_file():  # not such as /dev/null
-        _say_what_is_in(maps)
+    methods = method or ["auto"]
+    with tempfile.TemporaryDirectory(prefix="tactomo-") as folder:
+        files = {name: Path(folder, f"{at}.npz") for at, name in enumerate(methods)}
+        files[methods[0]] = maps
+        for name, file in files.items():
+            with progress_bar(f"reconstructing by {name}") as show:
+                made = reconstruct_file(
+                    scans,
+                    file,
+                    read=ReferencedScans(given, reference, read.companions),
+                    description=sensor,
+                    method=name,
+                    progress=show,
+                    curve=curve,
+                    taught=lesson,
+                )
+            if made.failed:
+                say(
+                    f"{made.failure}; instead, tikhonov made {counted(made.failed, 'frame')}",
+                    err=True,
+                )
+            if file == maps:
+                say(f"wrote {maps}: {made.frames} frames")
+            if file == maps and made.repeated:
+                say(
+                    f"left out: {counted(made.repeated, 'scan')} that repeat earlier ones, though "
+                    "scans at rest have noise; either the converter is frozen, or the file holds "
+                    "frames twice",
+                    err=True,
+                )
+        if not maps.is_file():  # such as /dev/null
+            return
+        from tactomo.cli.files.reconstructed import draw_methods, print_summary
 
-
-def _say_what_is_in(maps: Path) -> None:
-    """Say how many frames have which flag, and how many contacts there are."""
-    import numpy as np
-    from tactomo_models import Flag
-
-    from tactomo.service.health_issues import FLAG_ADVICE
-
-    with np.load(maps) as arrays:
-        flags, contacts = arrays["flags"], len(arrays["contact_frame"])
-    names = Counter(name for value in flags for name in Flag(int(value)).names())
-    for name, count in names.most_common():
-        say(f"{count} of {len(flags)} frames are flagged {name}: {FLAG_ADVICE[name][0]}")
-    if not names:
-        say("no frame is flagged")
-    say(f"{counted(contacts, 'contact')} in all frames together")
+        print_summary(maps)
+        if picture is not None:
+            save_figure(draw_methods(files, sensor, f"{scans.name}, {sensor.name}"), picture)
+            say(f"wrote {picture}")
 
 
 def _is_of_reconstruct(path: Path) -> bool:

@@ -51,7 +51,11 @@ def draw_page(
     areas = dict(zip(parts, column[:, 0], strict=True))
     colours = _contact_colours(course)
     if maps:
-        _draw_strip(areas["strip"], maps, description)
+        titles = [
+            f"{letter}   {moment.time_s:.2f} s"
+            for letter, moment in zip(LETTERS, maps, strict=False)
+        ]
+        draw_strip(areas["strip"], [moment.frame for moment in maps], description, titles)
     if has_path and rows:
         left, right = areas["body"].subfigures(1, 2, width_ratios=(1.0, 1.35))
         _draw_path(left, course, description, colours)
@@ -87,23 +91,28 @@ def _contact_colours(course: Course) -> dict[str, Any]:
     return {name: palette[i % len(palette)] for i, name in enumerate(course.tracks)}
 
 
-def _draw_strip(figure: Any, maps: Sequence[Moment], description: SensorDescription | None) -> None:
-    """Draw the maps side by side, on one scale, with a bar of its colours as tall."""
+def draw_strip(
+    figure: Any,
+    frames: Sequence[Frame],
+    description: SensorDescription | None,
+    titles: Sequence[str],
+) -> None:
+    """Draw the frames' maps side by side, on one scale, with a bar of its colours as tall."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 
     about = {} if description is None else description_fields(description)
-    axes_row = np.atleast_1d(figure.subplots(1, len(maps), sharey=True))
-    for axes, letter, moment in zip(axes_row, LETTERS, maps, strict=False):
-        _draw_map(axes, moment.frame, about)
-        axes.set_title(f"{letter}   {moment.time_s:.2f} s", fontsize=10)
+    axes_row = np.atleast_1d(figure.subplots(1, len(frames), sharey=True))
+    for axes, frame, title in zip(axes_row, frames, titles, strict=True):
+        _draw_map(axes, frame, about)
+        axes.set_title(title, fontsize=10)
     axes_row[0].set_ylabel("y (mm)")
-    known = [s for moment in maps if (s := shown_image(moment.frame, about))]
+    known = [s for frame in frames if (s := shown_image(frame, about))]
     if known:
         colours = LinearSegmentedColormap.from_list("map", np.array(COLOURS) / 255)
         scale = ScalarMappable(Normalize(0, known[0][1]), colours)
         beside_last = axes_row[-1].inset_axes((1.05, 0.0, 0.06, 1.0))
-        figure.colorbar(scale, cax=beside_last, label=_scale_label(maps[0].frame))
+        figure.colorbar(scale, cax=beside_last, label=_scale_label(frames[0]))
 
 
 def _scale_label(frame: Frame) -> str:
