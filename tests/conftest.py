@@ -21,6 +21,7 @@ from selenium.common.exceptions import WebDriverException
 from selenium.webdriver.chrome.service import Service
 from tactomo.cli import main
 from tactomo.ending import AS_WELL, ASKED
+from tactomo_client.fake import FakeSensor
 from threadpoolctl import threadpool_limits
 
 pytest_plugins = ["model_fixtures"]
@@ -164,6 +165,13 @@ def browser(_chromium: webdriver.Chrome) -> Iterator[webdriver.Chrome]:
     _chromium.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
     _chromium.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": False})
     _chromium.get("about:blank")
+
+
+@pytest.fixture
+def sensor() -> Iterator[FakeSensor]:
+    """A sensor of the name `left` on a real socket, which says what a test has it say."""
+    with FakeSensor("left") as sensor:
+        yield sensor
 
 
 @dataclass(frozen=True)

@@ -41,12 +41,6 @@ def publish(sensor: FakeSensor, **changes: Any) -> None:
     sensor.publish(contacts_of(PRESSED), **images, **changes)
 
 
-@pytest.fixture
-def sensor() -> Iterator[FakeSensor]:
-    with FakeSensor("left") as fake:
-        yield fake
-
-
 def test_a_picture_holds_the_numbers_of_the_map(sensor: FakeSensor) -> None:
     with camera(sensor) as skin:
         publish(sensor)

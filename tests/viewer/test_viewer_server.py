@@ -123,17 +123,6 @@ async def viewer_of(
         yield Viewer(client)
 
 
-@pytest.fixture
-def sensor() -> FakeSensor:
-    return FakeSensor("left")
-
-
-@pytest.fixture(autouse=True)
-def _close_sensor(sensor: FakeSensor) -> Any:
-    yield
-    sensor.close()
-
-
 # What the page gets
 
 
