@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import json
 import queue
-import signal
 import socket
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from http.client import HTTPConnection
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -20,6 +19,7 @@ import numpy as np
 import pytest
 from foxglove_client import PROTOCOL, FoxgloveClient
 from recorded_grasp import contacts_of, images_of
+from tactomo.cli.children import Family
 from tactomo.imaging.frames import description_fields
 from tactomo_client import Contact, MessageError
 from tactomo_client.fake import FakeSensor
@@ -105,12 +105,6 @@ def bridged(stream: str, **options: Any) -> Iterator[Bridge]:
 
 
 @pytest.fixture
-def sensor() -> Iterator[FakeSensor]:
-    with FakeSensor("left") as sensor:
-        yield sensor
-
-
-@pytest.fixture
 def source(sensor: FakeSensor) -> Iterator[Publishing]:
     with publishing(sensor) as source:
         yield source
@@ -126,7 +120,7 @@ def words_of(scene: Any) -> str:
     return " ".join(text.text for entity in scene.entities for text in entity.texts)
 
 
-def test_it_advertises_its_topics_with_their_schemas(client: FoxgloveClient) -> None:
+def test_it_advertises_its_topics_and_the_sheet_lies_in_the_world(client: FoxgloveClient) -> None:
     assert set(client.channels) == {"/tf", *(f"/left/{name}" for name in ALL)}
     assert all(channel["schema"] for channel in client.channels.values())
     numbers = json.loads(client.channels["/left/frame"]["schema"])["properties"]
@@ -136,6 +130,12 @@ def test_it_advertises_its_topics_with_their_schemas(client: FoxgloveClient) -> 
     assert kinds["/left/contacts"] == "foxglove.SceneUpdate"
     assert kinds["/left/grid"] == "foxglove.Grid"
     assert kinds["/left/events"] == "foxglove.Log"
+    transform = client.wait("/tf").transforms[0]
+    sheet = client.wait("/left/sheet").entities[0]
+    assert (transform.parent_frame_id, transform.child_frame_id) == ("world", "left")
+    assert (transform.translation.x, transform.rotation.w) == (0.0, 1.0)
+    assert len(sheet.cubes) == 16
+    assert max(point.x for point in sheet.lines[0].points) == pytest.approx(0.075)
 
 
 def test_contacts_are_discs_as_high_as_the_pressure(client: FoxgloveClient) -> None:
@@ -238,15 +238,6 @@ def test_numbers_to_plot_and_what_the_daemon_finds_wrong(
     client.wait("/left/frame", anew=True)
 
 
-def test_the_sheet_lies_in_the_world(client: FoxgloveClient) -> None:
-    transform = client.wait("/tf").transforms[0]
-    sheet = client.wait("/left/sheet").entities[0]
-    assert (transform.parent_frame_id, transform.child_frame_id) == ("world", "left")
-    assert (transform.translation.x, transform.rotation.w) == (0.0, 1.0)
-    assert len(sheet.cubes) == 16
-    assert max(point.x for point in sheet.lines[0].points) == pytest.approx(0.075)
-
-
 def test_old_data_are_shown_as_old_until_new_ones_come(
     source: Publishing, client: FoxgloveClient
 ) -> None:
@@ -310,19 +301,18 @@ def test_an_address_that_is_taken(sensor: FakeSensor) -> None:
         Bridge(["no sensor"], sensor.address, port=0)
 
 
-def test_the_command_serves_until_it_is_stopped(sensor: FakeSensor, tmp_path: Any) -> None:
+def test_the_command_serves_until_it_is_stopped(sensor: FakeSensor, tmp_path: Path) -> None:
     layout = tmp_path / "left.json"
-    command = [
-        *(sys.executable, "-m", "tactomo.cli", "foxglove", "left", "--address", sensor.address),
-        *("--foxglove-port", "0", "--layout", str(layout), "--announce"),
-    ]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        said = next(line for line in process.stdout if line.startswith("{"))
-        with publishing(sensor), FoxgloveClient(json.loads(said)["url"]) as client:
+    with Family() as family:
+        bridge = family.start(
+            *("bridge", "foxglove", "left", "--address", sensor.address, "--announce"),
+            *("--foxglove-port", "0", "--layout", str(layout)),
+        )
+        url = bridge.wait_ready()["url"]
+        with publishing(sensor), FoxgloveClient(url) as client:
             client.wait("/left/frame")
-            process.send_signal(signal.SIGTERM)
-            assert process.wait(60) == 0
+            bridge.stop(PATIENCE_S)
+        assert bridge.status == 0
     assert "/left/contacts" in layout.read_text()
 
 

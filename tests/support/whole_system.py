@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tactomo.cli.children import Family
 from tactomo_client import request
 from waiting import PATIENCE_S
 
@@ -79,14 +80,9 @@ def repository() -> Path:
 @contextmanager
 def twin_of(description: Path, ports: Path) -> Iterator[dict[str, list[str]]]:
     """Run `tactomo twin` of a description file, its ports in a folder; yields what it announces."""
-    command = [
-        *(sys.executable, "-m", "tactomo.cli", "twin", "--announce", "--twin-control", ANYWHERE),
-        *("--description", str(description), "--link", str(ports), "--rate", "10"),
-    ]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        try:
-            yield json.loads(next(line for line in process.stdout if line.startswith("{")))
-        finally:
-            process.terminate()
-            process.wait(PATIENCE_S)
+    with Family() as family:
+        announced = family.start(
+            *("twin", "twin", "--announce", "--twin-control", ANYWHERE),
+            *("--description", str(description), "--link", str(ports), "--rate", "10"),
+        ).wait_ready()
+        yield dict(announced)
