@@ -160,17 +160,13 @@ def test_topic_and_body_must_agree() -> None:
         decode_message(b"right/map\0" + body)
 
 
-@pytest.mark.parametrize("sensor", ["le ft", "", "ä", "a/b"])
-def test_a_topic_that_nobody_may_use_is_refused(sensor: str) -> None:
+@pytest.mark.parametrize("sensor", ["le ft", "", "a/b", "a\0", "ä", "a" * 65, ".hidden"])
+def test_names_that_cannot_be_topics_are_refused(sensor: str) -> None:
+    with pytest.raises(MessageError, match="sensor name"):
+        topic(sensor, "map")
     body = msgpack.packb({"schema": 1, "sensor": sensor, "kind": "map"} | HEADER)
     with pytest.raises(MessageError):
         decode_message(f"{sensor}/map".encode() + b"\0" + body)
-
-
-@pytest.mark.parametrize("sensor", ["", "a/b", "a\0", "ä", "a" * 65, ".hidden", None])
-def test_names_that_cannot_be_topics_are_refused(sensor: Any) -> None:
-    with pytest.raises(MessageError, match="sensor name"):
-        topic(sensor, "map")
 
 
 @given(command=st.text(), arguments=st.dictionaries(st.text(), scalars.filter(lambda v: v == v)))

@@ -110,14 +110,6 @@ def guarded(bench: Start, robot: Robot) -> Any:
     return bench(keys=Keys.load(desk), **robot.config)
 
 
-def test_an_allowed_client_commands_and_reads_frames(guarded: Any, robot: Robot) -> None:
-    guarded.tare()
-    folder = robot.allow(robot.client("ros"))
-    assert guarded.ask("status")["state"] in ("running", "stale")
-    with subscribe(SERVER, address=guarded.daemon.stream_address, keys=folder) as skin:
-        assert first_frame(guarded, skin).sensor == SERVER
-
-
 def first_frame(guarded: Any, skin: Subscription[Frame]) -> Frame:
     """Return the first frame that comes to a subscription, of a skin that goes on scanning."""
     frame = wait_until(skin.latest, meanwhile=lambda: guarded.step(0.1))
@@ -171,9 +163,24 @@ def test_another_process_gets_in_with_the_folder_alone(guarded: Any, robot: Robo
     assert "TACTOMO_KEYS" in said.stderr
 
 
-def test_the_viewer_gets_in(guarded: Any) -> None:
+def test_who_is_allowed_reads_and_commands_and_so_do_viewer_and_specification(
+    guarded: Any, robot: Robot, tmp_path: Path
+) -> None:
+    address = guarded.daemon.stream_address
+    folder = robot.allow(robot.client("ros"))
+    (example,) = Page("clients/STREAM.md").blocks("python", "Beyond the machine")
+    (tmp_path / "health.py").write_text(example)
+    command = [sys.executable, "-I", tmp_path / "health.py", folder, SERVER, address]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "waiting_for_data\n"
+        process.kill()
+    guarded.tare()
+    with subscribe(SERVER, address=address, keys=folder) as skin:
+        assert first_frame(guarded, skin).sensor == SERVER
+
     async def look() -> tuple[Status, dict[str, Any]]:
-        feed = Feed(SERVER, guarded.daemon.stream_address, guarded.keys, lambda: None)
+        feed = Feed(SERVER, address, guarded.keys, lambda: None)
         link = aio.Control(guarded.daemon.control_address, keys=guarded.keys)
         reading = asyncio.create_task(feed.run())
         try:
@@ -188,20 +195,6 @@ def test_the_viewer_gets_in(guarded: Any) -> None:
 
     status, answer = asyncio.run(look())
     assert status.fields["session"] == answer["session"] == guarded.daemon.session
-
-
-def test_the_example_of_the_specification_gets_in(
-    guarded: Any, robot: Robot, tmp_path: Path
-) -> None:
-    (example,) = Page("clients/STREAM.md").blocks("python", "Beyond the machine")
-    script = tmp_path / "health.py"
-    script.write_text(example)
-    folder = robot.allow(robot.client("ros"))
-    command = [sys.executable, "-I", script, folder, SERVER, guarded.daemon.stream_address]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "waiting_for_data\n"
-        process.kill()
 
 
 @pytest.mark.slow
@@ -227,7 +220,9 @@ def test_a_client_that_is_not_listed_is_refused_and_told_of(guarded: Any, robot:
         assert first_frame(guarded, skin)
 
 
-def test_a_reader_may_not_command(guarded: Any, robot: Robot) -> None:
+def test_a_reader_may_not_command_and_another_servers_key_is_noticed(
+    guarded: Any, robot: Robot
+) -> None:
     ros = robot.allow(robot.client("ros"))
     with pytest.raises(KeysError) as refused:
         request("tare", guarded.daemon.control_address, PATIENCE_S, keys=ros)
@@ -235,6 +230,11 @@ def test_a_reader_may_not_command(guarded: Any, robot: Robot) -> None:
     event = guarded.listener.event("client_refused")
     assert "may not use the control" in event["detail"]
     assert f"--for {SERVER} --may-command --keys {robot.folder}`" in event["next_step"]
+    key_files.make_pair(robot.folder, "impostor", is_server=True)
+    misled = robot.allow(robot.client("misled", server="impostor"))
+    with pytest.raises(KeysError) as caught:
+        request("status", guarded.daemon.control_address, PATIENCE_S, keys=misled)
+    assert caught.value.name == "wrong_server"
 
 
 def test_a_reader_is_told_who_can_put_a_calibration_in_force(
@@ -252,14 +252,6 @@ def test_a_reader_is_told_who_can_put_a_calibration_in_force(
     commander = robot.allow(robot.client("chief"), may_command=True)
     told = reload.taken_up(made, path, guarded.daemon.stream_address, commander)
     assert "the description's table" in told
-
-
-def test_the_wrong_server_key_is_noticed(guarded: Any, robot: Robot) -> None:
-    key_files.make_pair(robot.folder, "impostor", is_server=True)
-    misled = robot.allow(robot.client("misled", server="impostor"))
-    with pytest.raises(KeysError) as caught:
-        request("status", guarded.daemon.control_address, PATIENCE_S, keys=misled)
-    assert caught.value.name == "wrong_server"
 
 
 @pytest.mark.slow
@@ -365,16 +357,15 @@ def test_nobody_new_comes_in_by_a_list_that_was_opened(guarded: Any, robot: Robo
         next(iter(skin))
 
 
-def test_a_bad_file_on_the_list_locks_nobody_else_out(guarded: Any, robot: Robot) -> None:
+def test_a_bad_file_on_the_list_locks_nobody_else_out_and_no_list_everybody(
+    guarded: Any, robot: Robot
+) -> None:
     listed = key_files.clients_folder(robot.folder, SERVER)
     (listed / "broken.key").write_text("public-key = nonsense\n")
     (listed / "folder.key").mkdir()
     assert "broken.key" in guarded.listener.event("client_key_unusable")["detail"]
     assert guarded.ask("status")
-
-
-def test_a_list_that_cannot_be_read_lets_nobody_in(guarded: Any, robot: Robot) -> None:
-    shutil.rmtree(key_files.clients_folder(robot.folder, SERVER))
+    shutil.rmtree(listed)  # and one that cannot be read lets nobody in
 
     def is_locked_out() -> bool:
         try:

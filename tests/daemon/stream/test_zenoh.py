@@ -278,7 +278,7 @@ def test_clients_of_zeromq_find_all_skins_at_one_address(
         last = message.fields["sequence"]
 
 
-def test_late_joiners_get_the_last_status_at_once(
+def test_late_joiners_get_the_last_status_at_once_unless_the_daemon_is_gone(
     left: FakeSensor, start: Start, connect: Any
 ) -> None:
     start(left, robot="arm")
@@ -299,20 +299,11 @@ def test_late_joiners_get_the_last_status_at_once(
     for prefix in (topic("left", "status"), b"left/", b""):
         wait_until(partial(is_repeated, prefix), "a status at once")
 
-
-@pytest.mark.slow
-def test_a_status_of_a_daemon_that_is_gone_is_not_repeated(
-    desk: zenoh.Session, start: Start, connect: Any
-) -> None:
-    address = start(bind="tcp://127.0.0.1:0").address
-    first = connect(zmq.SUB, address, topic("left", "status"))
-    put = partial(desk.put, "tactomo/arm/left/status", b"\x80", attachment="1")
-    wait_until(lambda: first.poll(0), meanwhile=put, step_s=0.02)
-
     def is_silent() -> bool:
         with connect(zmq.SUB, address, topic("left", "status")) as late:
             return not late.poll(500)
 
+    left.close()
     wait_until(is_silent, "a status too old to be repeated")
 
 
@@ -364,28 +355,17 @@ def test_a_source_that_never_answered_is_missed_once(tmp_path: Path, start: Star
         assert left.address in running.said("source_came")["detail"]
 
 
-def test_a_web_pages_subscription_gets_nothing(
+def test_what_is_lost_is_told_and_a_web_pages_subscription_gets_nothing(
     desk: zenoh.Session, start: Start, connect: Any
 ) -> None:
     running = start(bind="tcp://127.0.0.1:0")
     one = connect(zmq.SUB, running.address, b"left/")
-    put = partial(desk.put, "tactomo/arm/left/contacts", b"\x80", attachment="1")
-    wait_until(lambda: one.poll(0), meanwhile=put, step_s=0.02)
-    assert b"left" not in post(running.address, [SUBSCRIBE + b"left/"])
-
-
-def test_what_is_lost_is_counted_and_told(
-    desk: zenoh.Session, start: Start, connect: Any, left: FakeSensor
-) -> None:
-    running = start(bind="tcp://127.0.0.1:0")
-    socket = connect(zmq.SUB, running.address, b"")
-    key, body = "tactomo/arm/left/contacts", b"\x80"
-    wait_until(
-        lambda: socket.poll(0), meanwhile=lambda: desk.put(key, body, attachment="1"), step_s=0.02
-    )
+    put = partial(desk.put, "tactomo/arm/left/contacts", b"\x80")
+    wait_until(lambda: one.poll(0), meanwhile=lambda: put(attachment="1"), step_s=0.02)
     for count in ("2", "6", "not a number"):
-        desk.put(key, body, attachment=count)
+        put(attachment=count)
     assert running.said("messages_lost")["detail"].startswith("3 so far")
+    assert b"left" not in post(running.address, [SUBSCRIBE + b"left/"])
 
 
 @pytest.mark.slow
