@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import signal
 import subprocess
 import sys
 import threading
@@ -247,32 +246,6 @@ def test_one_who_came_later_is_named(bench: Start, hold: Hold, until: Until) -> 
     until(is_named)
     stop(other)
     until(lambda: b.ask("status")["ports"][0]["connected"])
-
-
-HOLDER = """
-import sys
-from tactomo.acquisition.open_serial import open_serial
-port = open_serial(sys.argv[1], 921600)
-print("held", flush=True)
-sys.stdin.read()
-"""
-
-
-@pytest.mark.slow
-def test_a_port_is_free_at_once_when_its_daemon_is_killed(line: Any) -> None:
-    command = [sys.executable, "-c", HOLDER, str(line.path)]
-    other = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    try:
-        assert other.stdout is not None
-        assert other.stdout.readline() == b"held\n"
-        with pytest.raises(PortBusyError, match=f"pid {other.pid}: "):
-            open_serial(str(line.path), 921_600)
-        other.send_signal(signal.SIGKILL)
-        other.wait()
-        open_serial(str(line.path), 921_600).close()
-    finally:
-        other.kill()
-        other.communicate()
 
 
 # Those that are there and do not speak

@@ -263,29 +263,3 @@ def test_every_scan_is_accounted_for(bench: Start, lossless: bool) -> None:
 def settled(scans: dict[str, int], sent: int) -> dict[str, int] | None:
     assert scans["waiting"] >= 0
     return scans if scans["received"] == sent and not scans["waiting"] else None
-
-
-@pytest.mark.long
-def test_a_live_device_is_dated_once_its_clock_is_known(bench: Start) -> None:
-    b = bench()
-    b.tare()
-    start_ns = time.monotonic_ns()
-
-    def scan(at_ns: int | None = None) -> int:
-        now_ns = time.monotonic_ns() if at_ns is None else at_ns
-        counter: int = b.skin.scan(device_us=10**9 + (now_ns - start_ns) // 1000)
-        b.listener.frame(counter)
-        return counter
-
-    def is_settled() -> bool:
-        scan()
-        return any(s["ports"][0]["clock"]["state"] == "settled" for s in b.listener.of("status"))
-
-    b.until(is_settled)
-    taken_ns = time.monotonic_ns()
-    b.until(lambda: time.monotonic_ns() > taken_ns + 700_000_000)  # held up on its way
-    frame = b.listener.frame(scan(taken_ns))
-    assert frame["dated_by"] == "device"
-    assert abs(frame["acquired_monotonic_ns"] - taken_ns) < 50e6
-    assert frame["delay_ns"] > 600e6
-    assert frame["age_ns"] > 600e6

@@ -172,14 +172,6 @@ def test_a_whole_recording_is_copied(tmp_path: Path) -> None:
     assert messages(output) == messages(tmp_path / "damaged.mcap")
 
 
-@pytest.mark.slow
-def test_cut_anywhere_in_the_last_chunks(tmp_path: Path) -> None:
-    for length in range(chunks()[-2][0], len(whole())):
-        if length % 97 and length < len(whole()) - 30:
-            continue  # every byte takes a minute: the slow test below does that
-        assert_honest(tmp_path, whole()[:length])
-
-
 def test_frames_whose_calibration_is_lost_are_absent(tmp_path: Path) -> None:
     start, end = chunks()[RECALIBRATED // A_CHUNK]
     data = bytearray(whole())
@@ -189,10 +181,13 @@ def test_frames_whose_calibration_is_lost_are_absent(tmp_path: Path) -> None:
     assert [mark.scans[0].counter for mark in marks] == list(range(RECALIBRATED))
 
 
-@pytest.mark.long
 @pytest.mark.timeout(1800)
-def test_cut_at_every_byte(tmp_path: Path) -> None:
-    for length in range(len(whole())):
+@pytest.mark.parametrize(
+    "step", [pytest.param(397, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.long)]
+)
+def test_cut_anywhere(tmp_path: Path, step: int) -> None:
+    end = len(whole())
+    for length in (*range(0, end - 30, step), *range(end - 30, end)):
         assert_honest(tmp_path, whole()[:length])
 
 
