@@ -13,11 +13,9 @@ from typing import Any
 import pytest
 import tactomo_client
 from fake_control import FakeControl
-from tactomo.recordings.recording import Origin
-from tactomo.recordings.recording_writer import RecordingWriter, message_entry
+from recorded_grasp import write_grasp
 from tactomo_client import Contact, ControlError, aio
 from tactomo_client.fake import FakeSensor
-from tactomo_client.messages import MAP, encode_message
 from waiting import repeated, wait_until
 
 README = (Path(__file__).parents[2] / "clients" / "python" / "README.md").read_text("utf-8")
@@ -158,19 +156,7 @@ def test_recordings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    writer = RecordingWriter(Path("grasp.mcap"), Origin("left", "", "", ("a",), "0.1.0"))
-    for number in range(41):
-        at_ns = number * 50_000_000
-        header: dict[str, Any] = {
-            **{"session": "a", "sequence": number, "scan_counter": number, "device_us": None},
-            **{"acquired_realtime_ns": at_ns, "acquired_monotonic_ns": at_ns, "age_ns": 0},
-            **{"tier": None, "tier_reason": None, "flags": [], "misfit": None, "contacts": []},
-        }
-        extent = {"x_mm": [0.0, 1.0], "y_mm": [0.0, 1.0]}
-        for kind, fields in ((MAP, header | extent), ("contacts", header)):
-            message = encode_message("left", kind, fields)
-            writer.add(message_entry(kind, message, at_ns, at_ns))
-    writer.close()
+    write_grasp(Path("grasp.mcap"), range(41))
     exec(EXAMPLES["Recordings"], {})
     lines = capsys.readouterr().out.splitlines()
     assert lines == ["left 2.0 s whole", *(f"{number} 0" for number in range(10, 20))]

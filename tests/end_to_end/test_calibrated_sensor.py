@@ -10,8 +10,6 @@ from __future__ import annotations
 import math
 import re
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
@@ -23,7 +21,7 @@ from tactomo_client import Contact, request, subscribe
 from tactomo_client.recording import open_recording
 from terminal import Terminal
 from waiting import PATIENCE_S, wait_until
-from whole_system import ANYWHERE, twin_of
+from whole_system import ANYWHERE, tactomo, twin_of
 
 NAME = "palm"
 STIFFER = 1.2
@@ -159,11 +157,8 @@ def test_a_guided_session_makes_pressures_right(bench: Bench, tmp_path: Path) ->
 
 def replayed(recording: Path, again: Path) -> dict[int, list[float | None]]:
     """Replay a recording as a user would, and return what its contacts read then."""
-    command = ("replay", recording, "--speed", "max", "--record", again)
     addresses = ("--stream", ANYWHERE, "--control", ANYWHERE)
-    subprocess.run(
-        [sys.executable, "-m", "tactomo.cli", *command, *addresses], check=True, timeout=300
-    )
+    tactomo("replay", recording, "--speed", "max", "--record", again, *addresses)
     return pressures(again)
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -15,7 +13,7 @@ from tactomo_client import Daemon, Frame, subscribe
 from tactomo_client.recording import open_recording
 from tactomo_models.sensor.description_file import shipped_text
 from waiting import PATIENCE_S, wait_until
-from whole_system import ANYWHERE, SENSOR, Demo, running_demo
+from whole_system import ANYWHERE, SENSOR, Demo, running_demo, tactomo
 
 CELL = """
 [companion.load_cell]
@@ -79,13 +77,9 @@ def test_the_status_says_what_the_cell_reads_and_whether_it_is_believed(
 
 def replayed(live: Path, description: Path, again: Path) -> dict[int, Frame]:
     """Frames by scan counter, as a daemon makes them of a recording."""
-    command = [sys.executable, "-m", "tactomo.cli", "replay", live, "--speed", "max"]
-    options = ["--description", description, "--record", again]
-    anywhere = ["--stream", ANYWHERE, "--control", ANYWHERE]
-    done = subprocess.run(
-        [*map(str, [*command, *options, *anywhere])], capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    anywhere = ("--stream", ANYWHERE, "--control", ANYWHERE)
+    options = ("--description", description, "--record", again)
+    tactomo("replay", live, "--speed", "max", *options, *anywhere)
     return {frame.scan_counter: frame for frame in open_recording(again)}
 
 

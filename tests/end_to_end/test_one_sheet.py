@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from itertools import islice
@@ -27,7 +25,7 @@ from tactomo_client import (
 from tactomo_client.recording import open_recording
 from tactomo_models import load_description
 from waiting import PATIENCE_S, wait_until
-from whole_system import ANYWHERE, SENSOR, Demo, running_demo
+from whole_system import ANYWHERE, SENSOR, Demo, running_demo, tactomo
 
 GRADED, POLYGON, SATURATING = "graded_square", "palm_l", "skin_round"
 AT_MM = (-18.0, -15.0)
@@ -60,12 +58,6 @@ def pressed_frame(demo: Demo) -> Frame:
 
 def is_there(contacts: tuple[Contact, ...]) -> bool:
     return [math.dist((c.x_mm, c.y_mm), AT_MM) < NEAR_MM for c in contacts] == [True]
-
-
-def tactomo(*arguments: object) -> None:
-    command = [sys.executable, "-m", "tactomo.cli", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_a_press_becomes_a_contact_there_and_what_the_sheet_cannot_tell_is_absent(

@@ -18,12 +18,7 @@ from tactomo.recordings.recording import open_recording
 from tactomo_client import request, subscribe
 from tactomo_client.messages import MAP, decode_message
 from waiting import PATIENCE_S, wait_until
-from whole_system import ANYWHERE, SENSOR, Demo
-
-
-def tactomo(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tactomo.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+from whole_system import ANYWHERE, SENSOR, Demo, tactomo
 
 
 def maps_in(recording: Path) -> dict[int, dict[str, Any]]:
@@ -42,11 +37,10 @@ def maps_in(recording: Path) -> dict[int, dict[str, Any]]:
 def test_a_measured_stream_is_imported_replayed_and_located(tmp_path: Path) -> None:
     recording, again = tmp_path / "tank.mcap", tmp_path / "again.mcap"
     tank = measured("tank_sciospec_20fps.npz")
-    imported = tactomo(
+    tactomo(
         *("import", tank, recording, "--description", "tank_disc", "--reference-frames", "0:20")
     )
-    assert imported.returncode == 0, imported.stderr
-    replayed = tactomo(
+    tactomo(
         *(
             "daemon",
             "--description",
@@ -58,7 +52,6 @@ def test_a_measured_stream_is_imported_replayed_and_located(tmp_path: Path) -> N
         *("--set", "exit_at_end=true"),
         *("--stream", ANYWHERE, "--control", ANYWHERE),
     )
-    assert replayed.returncode == 0, replayed.stderr
     maps = maps_in(again)
     assert len(maps) == 255
     frames = [maps[counter] for counter in sorted(maps)]

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -24,6 +22,7 @@ from tactomo_client.recording import open_recording as open_frames
 from tactomo_models import load_description
 from tactomo_protocol import Scan
 from waiting import PATIENCE_S, wait_until
+from whole_system import tactomo
 
 TANK = "sciospec_disc"
 Start = Callable[..., tuple[Twin, DaemonProcess]]
@@ -40,13 +39,6 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 def is_streaming(twin: Twin) -> bool:
     return bool(request("status", twin.control, PATIENCE_S)["ports"][0]["streaming"])
-
-
-def tactomo(*arguments: object) -> str:
-    command = [sys.executable, "-m", "tactomo.cli", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 @pytest.mark.slow

@@ -14,7 +14,6 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from waiting import PATIENCE_S, wait_until
@@ -43,12 +42,7 @@ class Newcomer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def follow(self, commands: list[str]) -> list[str]:
@@ -101,17 +95,10 @@ class Newcomer:
     def _at(self, name: str) -> list[str]:
         """Options by which a program serves at free addresses; others find it there."""
         served = ["--stream", ANYWHERE, "--control", ANYWHERE]
+        twin = ["--twin-control", ANYWHERE, "--announce"]
         here = {
-            "demo": [
-                *served,
-                "--twin-control",
-                ANYWHERE,
-                "--no-browser",
-                "--viewer-port",
-                "0",
-                "--announce",
-            ],
-            "twin": ["--twin-control", ANYWHERE, "--announce"],
+            "demo": [*served, *twin, "--no-browser", "--viewer-port", "0"],
+            "twin": twin,
             "foxglove": ["--foxglove-port", "0", "--announce"],
             "viewer": ["--viewer-port", "0"],
             **dict.fromkeys(("daemon", "replay"), served),

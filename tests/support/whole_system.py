@@ -72,6 +72,14 @@ def running_demo(
             process.wait(PATIENCE_S)
 
 
+def tactomo(*arguments: object) -> str:
+    """Run a command, with which all is well, in a process of its own; return what it printed."""
+    command = [sys.executable, "-m", "tactomo.cli", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
 def repository() -> Path:
     """Root of this checkout."""
     return Path(__file__).parents[2]

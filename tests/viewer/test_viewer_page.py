@@ -71,6 +71,7 @@ class Skin:
         }
         self.events: list[dict[str, Any]] = []
         self.sends_frames = True
+        self.period_s = 0.05
         self._stop = threading.Event()
         self._sensor = FakeSensor("left", address)
         self.address = self._sensor.address
@@ -96,7 +97,7 @@ class Skin:
 
     def _run(self) -> None:
         tick = 0
-        while not self._stop.wait(0.05):
+        while not self._stop.wait(self.period_s):
             if tick % 5 == 0:
                 self._sensor.publish_message("status", self.status)
             while self.events:
@@ -328,7 +329,8 @@ def test_a_mounted_sheet_is_pressed_and_turned_on_its_surface(page: Page) -> Non
             frame="left_forearm_link",
         )
     ]
-    page.open(width=420, height=1600)  # fewer pixels, which a processor draws
+    page.open()
+    page.skin.period_s = 0.3  # a processor draws a surface, which takes a tenth of a second
     wait_until(lambda: page.js("return Boolean(tactomo.surface?.mesh)"))
     page.wait_until_pressable()
     assert "left_forearm_link" in page["surface-help"].text

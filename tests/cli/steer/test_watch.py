@@ -76,14 +76,11 @@ def test_it_shows_map_contacts_and_health_and_ends_by_ctrl_c(sensor: FakeSensor)
     assert "reads 255.5: 127.0 ± 2.5 N" in " ".join(shown.split())
 
 
-def test_it_says_when_data_are_stale() -> None:
+def test_it_says_when_data_are_stale_and_the_end_of_a_replay_is_not_called_so() -> None:
     with FakeSensor("left") as fake, old_frames(fake):
         shown, _ = in_a_terminal(until="STALE")
     assert "STALE: the newest frame is" in shown
     assert "nothing pressed" not in shown
-
-
-def test_the_end_of_a_replay_is_not_called_stale() -> None:
     with FakeSensor("left") as fake, old_frames(fake, {**STATUS, "state": "ended"}):
         shown, _ = in_a_terminal(until="19.7 frames/s")
     assert "STALE" not in shown

@@ -171,7 +171,7 @@ def test_a_device_of_another_skin_is_refused_by_its_name(bench: Start) -> None:
     assert b.ask("status")["ports"][0]["refusal"] is None
 
 
-def test_a_device_that_takes_the_place_of_another_is_told(bench: Start) -> None:
+def test_a_device_in_anothers_place_and_a_command_that_it_refuses_are_told(bench: Start) -> None:
     b = bench()
     b.tare()
     line = b.skin.lines[0]
@@ -184,12 +184,7 @@ def test_a_device_that_takes_the_place_of_another_is_told(bench: Start) -> None:
     assert "bench-2 is where bench-1 was" in event["detail"]
     assert "tare" in event["next_step"]
     assert b.step()["flags"] == []
-
-
-def test_a_command_that_the_device_refuses_is_told(bench: Start) -> None:
-    b = bench()
-    b.tare()
-    b.skin.lines[0].say(Acknowledge(3, CommandCode.START, AckStatus.BUSY))
+    line.say(Acknowledge(3, CommandCode.START, AckStatus.BUSY))
     assert "BUSY" in b.listener.event("command_refused")["detail"]
 
 

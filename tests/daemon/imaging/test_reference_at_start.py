@@ -49,6 +49,14 @@ def once(begin: Callable[..., Any]) -> None:
     assert reference_path("left").exists()
 
 
+def tare(b: Any, seen: Volts) -> None:
+    """Ask for a tare and send scans of these voltages until it is answered."""
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(b.ask, "tare")
+        while not answer.done():
+            b.step(volts=seen)
+
+
 def is_known(frame: Mapping[str, Any]) -> bool:
     return TOUCHES_SEEN.issuperset(frame["flags"])
 
@@ -70,33 +78,18 @@ def test_contacts_held_down_through_a_restart_are_still_there(begin: Any) -> Non
 @pytest.mark.slow
 def test_two_tares_on_command_override_the_reference_that_was_kept(begin: Any) -> None:
     once(begin)
-    b = begin(volts(True))
-    b.listener.event("reference_disputed")
-    for is_disputed in (True, False):  # contacts are shown during the first, none during the other
-        with ThreadPoolExecutor(1) as pool:
-            answer = pool.submit(b.ask, "tare")
-            while not answer.done():
-                b.step(volts=volts(True))
-        frame = b.step(volts=volts(True))
-        assert frame["contacts"] == []
-        assert ("reference_disputed" in frame["flags"]) == is_disputed
-    b.daemon.stop()
-    again = begin(volts(True))  # it is what the sensor was last known as
-    again.listener.event("tared")
-
-
-@pytest.mark.slow
-def test_what_a_tare_took_under_contacts_is_not_kept(begin: Any) -> None:
-    once(begin)
     kept = reference_path("left").read_bytes()
     b = begin(volts(True))
     b.listener.event("reference_disputed")
-    with ThreadPoolExecutor(1) as pool:
-        answer = pool.submit(b.ask, "tare")
-        while not answer.done():
-            b.step(volts=volts(True))
+    for is_disputed in (True, False):  # contacts are shown during the first, none during the other
+        tare(b, volts(True))
+        frame = b.step(volts=volts(True))
+        assert frame["contacts"] == []
+        assert ("reference_disputed" in frame["flags"]) == is_disputed
+        assert reference_path("left").read_bytes() == kept or not is_disputed
     b.daemon.stop()
-    assert reference_path("left").read_bytes() == kept
+    again = begin(volts(True))  # it is what the sensor was last known as
+    again.listener.event("tared")
 
 
 @pytest.mark.slow
@@ -174,10 +167,7 @@ def test_where_nobody_can_tell_what_lay_on_the_skin_every_frame_says_so_until_a_
         b.daemon.stop()
     assert reference_path("left").read_bytes() == b"no archive"
     b = begin(volts(False))
-    with ThreadPoolExecutor(1) as pool:
-        answer = pool.submit(b.ask, "tare")
-        while not answer.done():
-            b.step(volts=volts(False))
+    tare(b, volts(False))
     assert b.step(volts=volts(False))["flags"] == []
 
 

@@ -42,13 +42,15 @@ def test_frames_go_on_against_the_last_reference_until_the_new_one_is_understood
         answer = terminal.submit(b.ask, "tare")
         b.until(lambda: b.daemon._imaging.taring.is_on)  # the status is stale after a second
         for _ in range(b.daemon.config.tare_scans):
-            b.step(0.2)
+            shown = len(b.step(0.2)["contacts"])
         for _ in range(5):
             assert pressed(b.step(0.2)) > 0.15, "still pressed by the old reference"
         assert not answer.done()
         understood.set()
-        assert answer.result(60)["contacts"] == 1
-    b.until(lambda: abs(pressed(b.step(0.2))) < 0.01)
+        assert answer.result(60) == {"scans": 3, "contacts": shown}
+    b.listener.wait("event", lambda event: f"shown meanwhile: {shown} contact" in event["detail"])
+    b.until(lambda: abs(pressed(b.step(0.2))) < 1e-3)
+    assert b.step(0.2)["contacts"] == []
     assert b.ask("status")["dropped_scans"] == 0
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from daemon_process import DaemonProcess
+from page import Page
 from tactomo.config import load_config
 from tactomo.errors import ConfigError, RecordingError
 from tactomo.protocols import (
@@ -30,41 +31,13 @@ from variants import variant
 from waiting import repeated, wait_until
 
 SENSOR = load_description("matrix_disc")
-OWN = '''
-"""A board that sends frames of float32 volts: the letters EIT, then one number a voltage."""
+OWN = """
 
-import numpy as np
-from tactomo.protocols import ForeignProtocol, Reading
-
-MARK = b"EIT\\n"
+class Mute(FloatBoard):
+    name, emulator = "mute", ""
 
 
-class Floats(ForeignProtocol):
-    """See `tactomo.protocols.ForeignProtocol`."""
-
-    name = "floats"
-    device_id = "floats"
-    baud = 250_000
-
-    def __init__(self, description):
-        super().__init__(description)
-        self._rest = b""
-        self._length = len(MARK) + 4 * description.measurements
-
-    def parse(self, data):
-        self._rest += data
-        while (start := self._rest.find(MARK)) >= 0 and len(self._rest) >= start + self._length:
-            frame = self._rest[start + len(MARK) : start + self._length]
-            self._rest = self._rest[start + self._length :]
-            self.counts.packets += 1
-            yield Reading(np.frombuffer(frame, "<f4"))
-
-    @classmethod
-    def recognises(cls, data):
-        return MARK in data
-
-
-class Broken(Floats):
+class Broken(FloatBoard):
     name = "broken"
 
     def parse(self, data):
@@ -75,15 +48,16 @@ class Another:
     pass
 
 
-class Matrix(Floats):
+class Matrix(FloatBoard):
     name = "matrix"
-'''
+"""
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where the module lies; Python finds it there."""
-    (tmp_path / "own_board.py").write_text(OWN)
+    page = Page("docs/python.md")
+    (tmp_path / "own_board.py").write_text(page.file("float_board.py") + OWN)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(registry, "_named", {})
     return tmp_path
@@ -113,7 +87,7 @@ def test_the_daemon_reads_a_board_by_a_protocol_that_is_named(folder: Path, boar
         folder,
         [board],
         environment={"PYTHONPATH": str(folder)},
-        protocol="own_board:Floats",
+        protocol="own_board:FloatBoard",
         description="matrix_disc",
         method="tikhonov",
     )
@@ -121,19 +95,19 @@ def test_the_daemon_reads_a_board_by_a_protocol_that_is_named(folder: Path, boar
     try:
         wait_until(lambda: daemon.status()["state"] == "running", "a reference")
         [port] = daemon.status()["ports"]
-        assert (port["protocol"], port["device"]["device_id"]) == ("floats", "floats")
+        assert (port["protocol"], port["device"]["device_id"]) == ("float-board",) * 2
         daemon.ask("record_start", path=path.name)
         frames = daemon.status()["frames"]
         wait_until(lambda: daemon.status()["frames"] > frames + 10, "frames")
         daemon.ask("record_stop")
-        for module in ("own_board:Floats", "own_board:Broken"):
+        for module in ("own_board:FloatBoard", "own_board:Broken"):
             with pytest.raises(ControlError):
                 request("set_tier", daemon.control, tier=module)
     finally:
         daemon.stop()
-    find_protocol("own_board:Floats")
+    find_protocol("own_board:FloatBoard")
     recording = open_recording(path)
-    assert recording.origin.protocol == "floats"
+    assert recording.origin.protocol == "float-board"
     assert recording.summary.frames > 5
     assert sum(recording.summary.scans.values()) >= recording.summary.frames
 
@@ -169,8 +143,8 @@ def test_a_mistake_in_a_protocol_costs_no_port(folder: Path) -> None:
 
 
 def test_the_twin_says_what_it_needs_to_speak_it(folder: Path) -> None:
-    with pytest.raises(ConfigError, match=r"does not speak the protocol 'floats'.*emulator ="):
-        TwinConfig(SENSOR, protocol="own_board:Floats")
+    with pytest.raises(ConfigError, match=r"does not speak the protocol 'mute'.*emulator ="):
+        TwinConfig(SENSOR, protocol="own_board:Mute")
 
 
 @pytest.mark.slow
@@ -178,8 +152,10 @@ def test_ports_knows_it_by_what_it_sends(folder: Path, board: str) -> None:
     from tactomo.cli import app
 
     assert recognised(b"..EIT\n..") is None
-    result = CliRunner().invoke(app, ["ports", board, "--ask", "--protocol", "own_board:Floats"])
-    assert "--protocol floats" in " ".join(result.output.split())
+    result = CliRunner().invoke(
+        app, ["ports", board, "--ask", "--protocol", "own_board:FloatBoard"]
+    )
+    assert "--protocol float-board" in " ".join(result.output.split())
 
 
 class WithCell(ForeignProtocol):

@@ -331,23 +331,7 @@ def test_a_folder_that_cannot_be_made_does_not_keep_the_daemon_from_starting(
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_recorder_that_dies_is_told_of(bench: Start, tmp_path: Path) -> None:
-    b = bench(recording={"file": tmp_path / "a.mcap"})
-    b.tare()
-
-    def fail() -> None:
-        raise SystemExit  # which no guard takes for a failed recording
-
-    b.daemon._recorder._write = fail
-    failed = b.listener.event("recording_failed")
-    assert "died" in failed["detail"]
-    b.step()
-    assert b.ask("status")["recording"] is None
-    with pytest.raises(ControlError, match="died"):
-        b.ask("record_start")
-
-
-def test_a_mistake_of_ours_ends_the_recording_and_not_the_recorder(
+def test_a_mistake_of_ours_ends_the_recording_and_a_dead_recorder_is_told_of(
     bench: Start, tmp_path: Path
 ) -> None:
     b = bench(recording={"file": tmp_path / "a.mcap"})
@@ -358,9 +342,21 @@ def test_a_mistake_of_ours_ends_the_recording_and_not_the_recorder(
         b.daemon._recorder._write = write
         raise ZeroDivisionError("a mistake")
 
+    def end() -> None:
+        raise SystemExit  # which no guard takes for a failed recording
+
     b.daemon._recorder._write = fail
     assert "a mistake" in b.listener.event("recording_failed")["detail"]
     b.ask("record_start", path="b.mcap")
     b.step()
     b.ask("record_stop")
     assert open_recording(tmp_path / "b.mcap").summary.frames == 1
+    b.ask("record_start", path="c.mcap")
+    b.daemon._recorder._write = end
+    b.until(
+        lambda: b.step() and any("died" in each["detail"] for each in told(b, "recording_failed"))
+    )
+    b.step()
+    assert b.ask("status")["recording"] is None
+    with pytest.raises(ControlError, match="died"):
+        b.ask("record_start")

@@ -83,16 +83,13 @@ def test_a_scrape_says_what_the_status_says(bench: Bench, tmp_path: Path) -> Non
 
 
 def test_what_is_unknown_is_left_out_and_the_rules_name_what_there_is(bench: Bench) -> None:
+    assert bench(ports=1).daemon.metrics_address == ""  # none where there is no key
     daemon = bench(ports=1, metrics=ANYWHERE).daemon
     names = {name for name, _ in scrape(daemon)}
     assert "tactomo_age_seconds" not in names
     assert "tactomo_frames_total" in names
     asked = set(re.findall(r"\btactomo_[a-z_]+", RULES.read_text("utf-8")))
     assert asked - names <= {"tactomo_age_seconds", "tactomo_events_total"}
-
-
-def test_without_the_key_there_is_no_endpoint(bench: Bench) -> None:
-    assert bench(ports=1).daemon.metrics_address == ""
 
 
 def test_a_slow_scraper_disturbs_nobody_and_does_not_hold_up_the_stop(

@@ -16,7 +16,7 @@ from tactomo.errors import AddressError
 from tactomo.service.daemon import Daemon
 from tactomo.stream import control
 from tactomo_client import ControlError
-from tactomo_client.messages import array_from_wire, decode_reply, encode_request
+from tactomo_client.messages import decode_reply, encode_request
 from waiting import PATIENCE_S
 
 Start = Callable[..., Any]
@@ -58,25 +58,6 @@ def test_rates_are_what_comes_and_nothing_when_nothing_comes(bench: Start) -> No
     )
     b.listener.wait("status", lambda s: s["state"] == "stale")
     b.listener.wait("status", lambda s: s["rates"]["frames_hz"] == 0)
-
-
-@pytest.mark.slow
-def test_tare_is_answered_when_the_new_reference_holds(bench: Start) -> None:
-    b = bench(ports=2)
-    b.tare()
-    shown = len(b.step(load=0.2)["contacts"])
-    assert shown
-    answers: list[dict[str, Any]] = []
-    asking = threading.Thread(target=lambda: answers.append(b.ask("tare")))
-    asking.start()
-    while not answers:
-        b.step(load=0.2)  # the maps go on meanwhile, against the old reference
-    asking.join()
-    assert answers == [{"scans": 3, "contacts": shown}]
-    b.listener.wait("event", lambda event: f"shown meanwhile: {shown} contact" in event["detail"])
-    frame = b.step(load=0.2)
-    assert abs(array_from_wire(frame["map"])).max() < 1e-3
-    assert frame["contacts"] == []
 
 
 @pytest.mark.parametrize("sockets", [200, 1])
