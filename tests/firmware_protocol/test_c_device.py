@@ -75,56 +75,39 @@ def test_hello_comes_at_once_and_every_second_also_when_stopped(sanitized: Speak
         device.pass_time(100_000)
         heard += device.poll()
     assert kinds(heard) == [Hello] * 10
-
-
-def test_a_device_that_was_halted_does_not_make_up_for_missed_hellos(
-    device: SimulatedDevice,
-) -> None:
-    device.pass_time(10 * SECOND_US)
+    device.pass_time(10 * SECOND_US)  # halted: missed ones are not made up for
     assert kinds(device.poll()) == [Hello]
     device.pass_time(SECOND_US // 2)
     assert device.poll() == []
 
 
-def test_identify_is_acknowledged_and_hello_follows(device: SimulatedDevice) -> None:
+def test_commands_are_acknowledged_in_order_and_hello_follows(device: SimulatedDevice) -> None:
     acknowledge, hello = device.tell(Command(IDENTIFY, 200))
     assert acknowledge == Acknowledge(200, IDENTIFY, OK)
     assert isinstance(hello, Hello)
-
-
-def test_commands_in_a_row_are_acknowledged_in_order(device: SimulatedDevice) -> None:
-    commands = [Command(START, 1), Command(77, 2), Command(SET_RATE, 3, -1.0)]
-    said = device.tell(*commands)
+    said = device.tell(Command(START, 1), Command(77, 2), Command(SET_RATE, 3, -1.0))
     assert said == [
         Acknowledge(1, START, OK),
         Acknowledge(2, 77, UNKNOWN),
         Acknowledge(3, SET_RATE, BAD),
     ]
-
-
-def test_a_command_of_the_firmwares_own_gets_its_argument(device: SimulatedDevice) -> None:
-    argument = bytes([BUSY, 1, 2, 3, 4, 5, 6, 7])
+    argument = bytes([BUSY, 1, 2, 3, 4, 5, 6, 7])  # of a command of the firmware's own
     own = Command(0xF0, 9, *struct.unpack("<d", argument))
     assert statuses(device.tell(own)) == [BUSY], "tests/speak.c answers with its first byte"
     assert statuses(device.tell(Command(0xF1, 10))) == [UNKNOWN]
 
 
-@pytest.mark.parametrize("rate_hz", [float("nan"), 0.0, -0.0, -5.0, float("inf"), 1000.1, 1e308])
-def test_a_rate_that_cannot_be_is_refused(device: SimulatedDevice, rate_hz: float) -> None:
-    assert device.tell(Command(SET_RATE, 5, rate_hz)) == [Acknowledge(5, SET_RATE, BAD)]
-
-
-@pytest.mark.parametrize(
-    ("rate_hz", "kept_hz"),
-    [(40.0, 40.0), (1000.0, 1000.0), (30.0, 1e6 / 33_333), (1e-9, 0.001), (5e-324, 0.001)],
-)
-def test_the_nearest_rate_is_kept_and_stated(
-    device: SimulatedDevice, rate_hz: float, kept_hz: float
+def test_a_rate_that_cannot_be_is_refused_and_the_nearest_is_kept_and_stated(
+    device: SimulatedDevice,
 ) -> None:
-    acknowledge, hello = device.tell(Command(SET_RATE, 5, rate_hz))
-    assert acknowledge == Acknowledge(5, SET_RATE, OK)
-    assert isinstance(hello, Hello)
-    assert hello.scan_rate_hz == pytest.approx(kept_hz, rel=1e-12)
+    for rate_hz in (float("nan"), 0.0, -0.0, -5.0, float("inf"), 1000.1, 1e308):
+        assert device.tell(Command(SET_RATE, 5, rate_hz)) == [Acknowledge(5, SET_RATE, BAD)]
+    kept = {40.0: 40.0, 1000.0: 1000.0, 30.0: 1e6 / 33_333, 1e-9: 0.001, 5e-324: 0.001}
+    for rate_hz, kept_hz in kept.items():
+        acknowledge, hello = device.tell(Command(SET_RATE, 5, rate_hz))
+        assert acknowledge == Acknowledge(5, SET_RATE, OK)
+        assert isinstance(hello, Hello)
+        assert hello.scan_rate_hz == pytest.approx(kept_hz, rel=1e-12)
 
 
 def test_a_companions_reading_leaves_with_the_scans_clock(device: SimulatedDevice) -> None:
@@ -151,14 +134,10 @@ def test_what_cannot_be_read_is_not_answered(device: SimulatedDevice) -> None:
     assert statuses(device.tell(Command(STOP, 2))) == [OK]
 
 
-@pytest.mark.parametrize(
-    ("rate_hz", "shortest_period_us", "accepted"), [(1000.0, 1000, 1), (1001.0, 1000, 0)]
-)
-def test_a_device_that_could_not_keep_its_rate_does_not_begin(
-    sanitized: Speaker, rate_hz: float, shortest_period_us: int, accepted: int
-) -> None:
-    device = SimulatedDevice(sanitized, rate_hz=rate_hz, shortest_period_us=shortest_period_us)
-    assert device.accepted == accepted
+def test_a_device_that_could_not_keep_its_rate_does_not_begin(sanitized: Speaker) -> None:
+    for rate_hz, accepted in ((1000.0, 1), (1001.0, 0)):
+        device = SimulatedDevice(sanitized, rate_hz=rate_hz, shortest_period_us=1000)
+        assert device.accepted == accepted
 
 
 # --- scans, counter, clock, flags -----------------------------------------------------------------
@@ -199,6 +178,12 @@ def test_stop_is_the_end_and_the_counter_goes_on(scanning: SimulatedDevice) -> N
     first, _ = scanning.dual_scan()
     assert first is not None
     assert first.counter == 2
+    scanning.tell(Command(STOP, 6))  # alone, it takes none while stopped, and counts none
+    for _ in range(10):
+        scanning.pass_time(PERIOD_US)
+        assert not scanning.is_due
+    scanning.tell(Command(START, 7))
+    assert scanning.begin_scan() == 3
 
 
 def test_zero_counters_leaves_the_clock(scanning: SimulatedDevice) -> None:
@@ -259,28 +244,12 @@ def test_a_scan_that_a_newer_one_has_overtaken_keeps_its_counter_and_is_late(
     scan = follower.send(older)
     assert scan is not None
     assert (scan.counter, scan.flags) == (0, ScanFlag.LATE)
-
-
-def test_at_rate_0_a_scan_is_late_only_when_the_next_has_begun(sanitized: Speaker) -> None:
-    follower = SimulatedDevice(sanitized, role=FOLLOWER)
-    follower.tell(Command(START, 1))
+    # At rate 0 a scan is late only when the next has begun.
     counter, started_us = follower.begin_scan(), follower.timer_us
     follower.pass_time(3_600_000_000 // 4)
     scan = follower.send(counter, started_us=started_us)
     assert scan is not None
     assert scan.flags == 0
-
-
-def test_a_device_alone_takes_no_dual_scans_while_stopped_so_it_counts_none(
-    scanning: SimulatedDevice,
-) -> None:
-    scanning.dual_scan()
-    scanning.tell(Command(STOP, 2))
-    for _ in range(10):
-        scanning.pass_time(PERIOD_US)
-        assert not scanning.is_due
-    scanning.tell(Command(START, 3))
-    assert scanning.begin_scan() == 1
 
 
 def test_missed_scans_are_not_made_up(scanning: SimulatedDevice) -> None:

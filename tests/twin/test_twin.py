@@ -272,13 +272,21 @@ def test_a_script_starts_with_the_first_scan_that_a_host_receives(bench: Start) 
     assert after_us[end - 1] < 2_000_000 <= after_us[end] + 2
 
 
-def test_play_starts_a_scene_that_is_given_live(bench: Start) -> None:
+def test_scene_and_noise_are_changed_while_it_runs(bench: Start) -> None:
     started = bench()
     with pytest.raises(ControlError, match="no scripted scene"):
         started.ask("play")
     press = {"id": "p", "at_s": 0, "duration_s": 3600, "x_mm": 1, "y_mm": 2}
     assert started.ask("play", scene={"press": [press]}) == {"length_s": 3600.0}
     assert [p["id"] for p in started.ask("scene")["presses"]] == ["p"]
+    host = started.host()
+    host.start()
+    host.wait_for(lambda: host.scans())
+    assert np.ptp(host.scans()[0].samples) == 0
+    started.ask("noise", noise_v=0.01)
+    host.wait_for(lambda: np.ptp(host.scans()[-1].samples) > 0)
+    with pytest.raises(ControlError, match="not simulated"):
+        started.ask("drift", swing_k=10.0)
 
 
 def test_equal_seeds_give_equal_scans(bench: Start) -> None:
@@ -289,16 +297,6 @@ def test_equal_seeds_give_equal_scans(bench: Start) -> None:
         return [scan.samples.tobytes() for scan in host.scans()[:6]]
 
     assert first_scans(1) == first_scans(1) != first_scans(2)
-
-
-def test_noise_can_be_changed_while_it_runs(bench: Start) -> None:
-    started = bench()
-    host = started.host()
-    host.start()
-    host.wait_for(lambda: host.scans())
-    assert np.ptp(host.scans()[0].samples) == 0
-    started.ask("noise", noise_v=0.01)
-    host.wait_for(lambda: np.ptp(host.scans()[-1].samples) > 0)
 
 
 def test_the_skin_drifts_as_it_is_told_live_and_by_a_scene(bench: Start, tmp_path: Path) -> None:
@@ -320,11 +318,6 @@ def test_the_skin_drifts_as_it_is_told_live_and_by_a_scene(bench: Start, tmp_pat
     host.wait_for(lambda: np.array_equal(host.scans()[-1].samples, rest))
     with pytest.raises(ControlError, match="swing_k"):
         started.ask("drift", swing_k=-1.0)
-
-
-def test_a_skin_that_is_not_simulated_does_not_drift(bench: Start) -> None:
-    with pytest.raises(ControlError, match="not simulated"):
-        bench().ask("drift", swing_k=10.0)
 
 
 def test_nobody_gets_old_scans_and_nobody_blocks_the_twin(bench: Start) -> None:
@@ -479,12 +472,9 @@ def test_more_voltages_than_a_scan_can_have_are_told_at_the_start(
         begin(SensorDescription.model_validate(raw))
 
 
-def test_a_sensor_of_one_channel_has_no_two_ports() -> None:
+def test_what_the_emulated_board_or_sensor_lacks_is_told_at_the_start() -> None:
     with pytest.raises(ConfigError, match="1 channel"):
         TwinConfig(load_description("tank_disc"), ports=2)
-
-
-def test_an_emulated_board_without_companions_is_told_at_the_start() -> None:
     raw = load_description("openeit_disc").model_dump(by_alias=True, exclude_none=True)
     raw["companion"] = {"cell": {"gain_n_per_unit": 1.0, "noise_n": 0.1}}
     with pytest.raises(ConfigError, match=r"companion, cell, .* of protocol openeit sends no"):

@@ -71,13 +71,6 @@ def test_a_name_that_goes_while_it_is_read_is_absent(
     assert [Path(name).parent.name for name in adapter.names] == ["by-path"]
 
 
-def test_a_microcontroller_has_no_latency_timer(machine: FakeMachine) -> None:
-    machine.plug_acm("ttyACM0", "1-4", "7F3A")
-    adapter = adapter_at(machine, "/dev/ttyACM0")
-    assert (adapter.driver, adapter.serial_number) == ("cdc_acm", "7F3A")
-    assert adapter.latency_timer_ms is None
-
-
 def test_usb_comes_first_by_number_and_what_is_not_there_not_at_all(machine: FakeMachine) -> None:
     machine.build_in("ttyS0", 4)
     machine.build_in("ttyS1", 0)
@@ -104,11 +97,15 @@ def test_adapters_without_a_number_are_told_apart_by_their_socket(machine: FakeM
     assert alike == [["/dev/ttyUSB1"], ["/dev/ttyUSB0"], [], []]
 
 
-def test_a_name_of_our_own_rules_goes_before_others(machine: FakeMachine) -> None:
+def test_a_microcontroller_has_no_latency_timer_and_our_own_rules_name_goes_first(
+    machine: FakeMachine,
+) -> None:
     machine.plug_acm("ttyACM0", "1-4", "7F3A")
     machine.link("dev/tactomo/left_forearm", "dev/ttyACM0")
-    adapters = list_adapters(machine.root)
-    assert lasting_name(adapters[0], adapters) == "/dev/tactomo/left_forearm"
+    [adapter] = list_adapters(machine.root)
+    assert (adapter.driver, adapter.serial_number) == ("cdc_acm", "7F3A")
+    assert adapter.latency_timer_ms is None
+    assert lasting_name(adapter, [adapter]) == "/dev/tactomo/left_forearm"
 
 
 @pytest.mark.parametrize(
@@ -127,18 +124,15 @@ def test_modem_manager_is_known_to_be_kept_away(
     assert adapter_at(machine, "/dev/ttyUSB0").is_kept_from_modem_manager
 
 
-def test_modem_manager_is_seen_running(machine: FakeMachine) -> None:
+def test_programs_that_run_and_hold_ports_are_seen(machine: FakeMachine) -> None:
     machine.run(70, "NetworkManager")
-    assert not modem_manager_runs(machine.root)
-    machine.run(71, "ModemManager --filter-policy=strict")
-    assert modem_manager_runs(machine.root)
-
-
-def test_holders_are_named_by_their_command_line(machine: FakeMachine) -> None:
     machine.run(812, "screen /dev/ttyUSB0 115200", "/dev/ttyUSB0", "/dev/null")
     machine.run(813, "less notes.txt", "/home/notes.txt")
     (holder,) = holders("/dev/ttyUSB0", machine.root)
     assert str(holder) == "pid 812: screen /dev/ttyUSB0 115200"
+    assert not modem_manager_runs(machine.root)
+    machine.run(71, "ModemManager --filter-policy=strict")
+    assert modem_manager_runs(machine.root)
 
 
 def test_a_link_may_go_while_it_is_followed(

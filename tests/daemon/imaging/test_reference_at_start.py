@@ -115,7 +115,10 @@ def test_another_skin_is_not_taken_for_a_load(begin: Any) -> None:
     assert (frame["contacts"], frame["flags"]) == ([], [])
 
 
-@pytest.mark.parametrize("exchanged", [("own-0", "other-1"), ("other-0", "other-1")])
+@pytest.mark.parametrize(
+    "exchanged",
+    [("own-0", "other-1"), pytest.param(("other-0", "other-1"), marks=pytest.mark.slow)],
+)
 def test_boards_of_another_skin_are_named_at_the_start(
     bench: Start, exchanged: tuple[str, str]
 ) -> None:

@@ -112,10 +112,9 @@ def test_a_sensor_of_one_channel_has_one_port() -> None:
     "number",
     [
         signal.SIGTERM,
-        signal.SIGHUP,
         *(
             pytest.param(number, marks=pytest.mark.slow)
-            for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGUSR1)
+            for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1)
         ),
     ],
 )
