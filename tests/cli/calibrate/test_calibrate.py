@@ -157,7 +157,7 @@ def test_the_daemon_that_runs_is_asked_to_read_it_again(tactomo: Run) -> None:
         assert "in force now" in told.stdout
         assert "9 readings of 2026-01-31" in told.stdout
         control.answers["reload_calibration"] = {"calibration": None}
-        assert "found none" in tactomo(*command).stdout
+        assert "goes by the description's table" in tactomo(*command).stdout
         control.answers["reload_calibration"] = ControlError("damaged", "", "calibration_refused")
         refused = tactomo(*command)
         assert (refused.returncode, refused.stdout) == (1, "")

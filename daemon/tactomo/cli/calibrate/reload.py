@@ -9,8 +9,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from tactomo_client.schema import Calibration, Taught
-
 from tactomo.cli.output import say
 from tactomo.cli.sensors import SensorError, find_commanded, find_control
 
@@ -26,14 +24,8 @@ CONNECT_S: Final = 1.0  # how long to wait where nobody listens: there need not 
 def reload_kept(name: str | None, address: str | None, keys: Path | None) -> str:
     """Have the daemon of a sensor read its calibration again; return in words what is in force."""
     there = find_commanded(name, address, keys)
-    sensor, found = there.sensor, _reloaded(there.control, keys).calibration
-    if found is None:
-        return f"the daemon of {sensor} found none: pressures are the description's"
-    low, high = found.range_kpa
-    return (
-        f"in force now: the daemon of {sensor} goes by {found.readings} readings of "
-        f"{found.taken[:10]}, {low:.0f} to {high:.0f} kPa"
-    )
+    found = _reloaded(there.control, keys)
+    return f"in force now: the daemon of {there.sensor} goes by {_words(found)}"
 
 
 def keep(
@@ -55,38 +47,27 @@ def taken_up(
     made: PressureCalibration | TaughtSkin, path: Path, address: str | None, keys: Path | None
 ) -> str:
     """Have the sensor's daemon, if it runs, use what was kept; say in words what became of it."""
-    from tactomo_client import CalibrationRefused, ClientError, KeysError, NoAnswer
+    from tactomo_client import CalibrationRefused, ClientError
     from tactomo_models.calibration.calibration_file import PressureCalibration, calibration_path
     from tactomo_models.calibration.taught_skin import taught_path
 
     sensor = made.subject.sensor
     own = (calibration_path if isinstance(made, PressureCalibration) else taught_path)(sensor)
     again = f"tactomo calibrate reload --sensor {sensor}"
-    it = "It" if path.absolute() == own.absolute() else f"Copied to {own}, it"
-    later = f"{it} is in force when the daemon of {sensor} starts next, or by: {again}"
     try:
         found = _reloaded(find_control(sensor, address, keys), keys)
-    except (NoAnswer, SensorError) as error:
-        return f"not in force yet: {error.cause}. {later}"
     except CalibrationRefused as error:
         return f"not in force: the daemon of {sensor} refused it: {error}"
-    except KeysError as error:
-        return (
-            f"not in force yet: {error.cause}. Have somebody who may command run {again}, or start "
-            "the daemon anew"
-        )
-    except ClientError as error:
+    except (ClientError, SensorError) as error:
+        it = "It" if path.absolute() == own.absolute() else f"Copied to {own}, it"
+        later = f"{it} is in force when the daemon of {sensor} starts next, or by: {again}"
         return f"not in force yet: {error.cause}. {later}"
-    its = found.calibration if isinstance(made, PressureCalibration) else found.taught
-    if its is not None and _is_same(its, made):
+    if made.taken in [each.taken for each in (found.calibration, found.taught) if each]:
         return f"in force now: the daemon of {sensor} goes by it"
-    nothing = (
-        "the description's table" if isinstance(made, PressureCalibration) else "physics alone"
-    )
-    other = nothing if its is None else f"the one taken {its.taken}"
     return (
-        f"not in force: the daemon of {sensor} goes by {other}. It looks on its own computer, in "
-        f"its own data folder, or where its configuration says: copy {path} there, then {again}"
+        f"not in force: the daemon of {sensor} goes by {_words(found)}. It looks on its own "
+        f"computer, in its own data folder, or where its configuration says: copy {path} there, "
+        f"then {again}"
     )
 
 
@@ -97,10 +78,10 @@ def _reloaded(control: str, keys: Path | None) -> CalibrationInForce:
         return daemon.reload_calibration()
 
 
-def _is_same(its: Calibration | Taught, made: PressureCalibration | TaughtSkin) -> bool:
-    from tactomo_models.calibration.calibration_file import PressureCalibration
-
-    if isinstance(its, Calibration) and isinstance(made, PressureCalibration):
-        kept = (made.taken, len(made.readings), made.curve.range_kpa)
-        return (its.taken, its.readings, its.range_kpa) == kept
-    return its.taken == made.taken
+def _words(found: CalibrationInForce) -> str:
+    curve, taught = found.calibration, found.taught
+    words = "the description's table"
+    if curve is not None:
+        low, high = curve.range_kpa
+        words = f"{curve.readings} readings of {curve.taken}, {low:.0f} to {high:.0f} kPa"
+    return words if taught is None else f"{words}; {taught.presses} presses of {taught.taken}"

@@ -1,4 +1,4 @@
-"""`tactomo info`: what a recording, a folder, an artifact or a sensor description is."""
+"""`tactomo info`: what a recording, a file of arrays or a sensor description is."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli.options import JsonOutput, examples, need_recording, typer_app
-from tactomo.cli.output import print_json, table
+from tactomo.cli.output import print_json
 
 if TYPE_CHECKING:
     from tactomo_models import SensorDescription
@@ -22,7 +22,6 @@ app = typer_app()
 @app.command(
     epilog=examples(
         "tactomo info grasp.mcap",
-        "tactomo info ~/.local/share/tactomo/recordings",
         "tactomo info paper_square",
         "tactomo info my.toml",
     )
@@ -31,17 +30,13 @@ def info(
     what: Annotated[
         str,
         typer.Argument(
-            help="A recording (.mcap), a folder of them, a file that `tactomo reconstruct` reads "
-            "(.npz, .mat, .csv, .eit), a built artifact (.npz), or a sensor "
-            "description: a shipped name or a TOML file."
+            help="A recording (.mcap), a file that `tactomo reconstruct` reads (.npz, .mat, .csv, "
+            ".eit), a built artifact, or a sensor description: a shipped name or a TOML file."
         ),
     ],
     as_json: JsonOutput = False,
 ) -> None:
-    """Describe a recording, a folder of recordings, a file of scans or a sensor description."""
-    if Path(what).is_dir() and not any(Path(what).glob("*.eit")):
-        _show_folder(Path(what), as_json)
-        return
+    """Describe a recording, a file of scans or a sensor description."""
     facts = _facts(what)
     if as_json:
         print_json(facts)
@@ -55,44 +50,6 @@ def info(
     for name, value in facts.items():
         shown.add_row(Text(name, "bold"), _words(value))
     Console().print(shown)
-
-
-def _show_folder(folder: Path, as_json: bool) -> None:
-    """List the recordings in a folder by their names, which is by their age.
-
-    One that is not closed is being written, or was cut off, or is damaged.
-    """
-    rows = [_recording_line(path) for path in sorted(folder.glob("*.mcap"))]
-    if as_json:
-        print_json(rows)
-        return
-    from tactomo.cli.console import Console
-
-    columns = ("recording", "sensor", "began", "seconds", "MB", "ends")
-    listed = table(*columns, left=("sensor", "began", "ends"), title=str(folder))
-    for row in rows:
-        listed.add_row(*(str(value) for value in row.values()))
-    Console().print(listed)
-
-
-def _recording_line(path: Path) -> dict[str, Any]:
-    from tactomo.errors import RecordingError
-    from tactomo.recordings.recording import open_recording
-
-    line = {"recording": path.name, "sensor": "", "began": "", "seconds": 0.0}
-    line["MB"] = round(path.lstat().st_size / 1e6, 2)
-    try:
-        recording = open_recording(path)
-    except RecordingError:
-        return {**line, "ends": "no recording"}
-    span = recording.span
-    return {
-        **line,
-        "sensor": recording.origin.sensor,
-        "began": _date(span.start_ns),
-        "seconds": round((span.end_ns - span.start_ns) * 1e-9, 1),
-        "ends": "closed" if span.is_complete else "not closed",
-    }
 
 
 def _date(time_ns: int) -> str:
