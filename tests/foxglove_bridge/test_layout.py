@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 from tactomo_foxglove import layout_for, shipped_layout
-from tactomo_foxglove.topics import FRAME_SCHEMA, HEALTH_SCHEMA
+from tactomo_foxglove.topics import FRAME_SCHEMA
 
-TOPICS = {"sheet", "contacts", "grid", "frame", "health", "events"}
-SCHEMAS = {"frame": FRAME_SCHEMA, "health": HEALTH_SCHEMA}
+TOPICS = {"sheet", "contacts", "grid", "frame", "events"}
+SCHEMAS = {"frame": FRAME_SCHEMA}
 
 
 def texts(value: Any) -> Iterator[str]:
@@ -45,7 +45,7 @@ def test_every_panel_has_a_configuration() -> None:
 
 def test_it_names_no_topic_and_no_field_that_there_is_not() -> None:
     paths = [text for text in texts(json.loads(shipped_layout())) if text.startswith("/skin/")]
-    assert {path.split("/")[2].partition(".")[0] for path in paths} >= TOPICS - {"health"}
+    assert {path.split("/")[2].partition(".")[0] for path in paths} == TOPICS
     for path in paths:
         topic, _, rest = path.removeprefix("/skin/").partition(".")
         assert topic in TOPICS, path

@@ -31,12 +31,11 @@ from tactomo_client.messages import (
 )
 
 from tactomo_foxglove.door import FOXGLOVE_ORIGIN, Door, hidden_address
-from tactomo_foxglove.messages import known
-from tactomo_foxglove.topics import STATUS_NUMBERS, SensorTopics
+from tactomo_foxglove.topics import SensorTopics
 
 DEFAULT_HOST: Final = "127.0.0.1"
 DEFAULT_PORT: Final = 8765
-HEALTH_PERIOD_S: Final = 0.2
+LOOK_PERIOD_S: Final = 0.2
 REMIND_PERIOD_S: Final = 1.0
 BACKLOG: Final = 128
 
@@ -91,14 +90,14 @@ class Bridge:
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set; raise KeysError where the daemon does not let us in."""
-        next_health_s = time.monotonic()
+        next_look_s = time.monotonic()
         while not stop.is_set():
-            wait_s = max(0.0, next_health_s - time.monotonic())
+            wait_s = max(0.0, next_look_s - time.monotonic())
             if self._socket.poll(round(wait_s * 1e3) + 1):
                 self._take(self._socket.recv())
             now_s = time.monotonic()
-            if now_s >= next_health_s:
-                next_health_s = now_s + HEALTH_PERIOD_S
+            if now_s >= next_look_s:
+                next_look_s = now_s + LOOK_PERIOD_S
                 for sensor in self._sensors.values():
                     sensor.look_around(self._server)
                 if refusal := self._connection.refusal():
@@ -134,7 +133,8 @@ class _Sensor:
         self._frame: Frame | None = None
         self._status: Mapping[str, Any] = {}
         self._status_s = time.monotonic()
-        self._complained_s: float | None = None
+        self._age = _Problem(f"{topics.sensor} stale")
+        self._issues = _Problem(f"{topics.sensor} issues")
 
     def take(self, message: Message) -> None:
         now_ns = time.time_ns()
@@ -151,23 +151,16 @@ class _Sensor:
             self._topics.event(message.fields, now_ns)
 
     def look_around(self, server: WebSocketServer) -> None:
-        """Say how the daemon is, and complain about old data as long as they are old."""
-        self._topics.health(self._health(), time.time_ns())
-        trouble = self._trouble()
-        identity = f"{self._topics.sensor} stale"
-        if not trouble and self._complained_s is not None:
-            server.remove_status([identity])
-            self._complained_s = None
-        elif trouble and _is_due(self._complained_s):
-            self._complained_s = time.monotonic()
-            server.publish_status(trouble, StatusLevel.Warning, identity)
-            if self._frame is not None:
-                self._topics.stale(self._frame, trouble, time.time_ns())
+        """Complain about old data, and about what the daemon finds wrong, as long as that is so."""
+        trouble, issues = self._trouble(), self._status.get("issues") or ()
+        if self._age.tell(server, trouble) and self._frame is not None:
+            self._topics.stale(self._frame, trouble, time.time_ns())
+        self._issues.tell(server, "\n".join(f"{i['what']}: {i['next_step']}" for i in issues))
 
     def _trouble(self) -> str:
         """Return in words why what is shown is not what is now; empty while it is."""
         name = self._topics.sensor
-        if self._is_gone:
+        if time.monotonic() - self._status_s > schema.STALE_AFTER_S:
             return f"STALE: no daemon answers at {self._stream} for {name!r}: is it running?"
         if not self._status:
             return ""
@@ -178,28 +171,25 @@ class _Sensor:
             return f"STALE: {name!r} was felt {self._frame.age_s:.1f} s ago; {state}"
         return ""
 
-    @property
-    def _is_gone(self) -> bool:
-        return time.monotonic() - self._status_s > schema.STALE_AFTER_S
 
-    def _health(self) -> dict[str, Any]:
-        status, frame = self._status, self._frame
-        recording = status.get("recording") or {}
-        return known(
-            {
-                **{name: status.get(name) for name in (*STATUS_NUMBERS, "issues")},
-                "state": "gone" if self._is_gone else status.get("state"),
-                "is_stale": self._is_gone or frame is None or frame.is_stale,
-                "age_s": None if frame is None else frame.age_s,
-                "recording": recording.get("path"),
-                "rates": known((status.get("rates") or {}).items()),
-                "latency_ms": known((status.get("latency_ms") or {}).items()),
-            }.items()
-        )
+class _Problem:
+    """One entry of Foxglove's list of problems."""
 
+    def __init__(self, identity: str) -> None:
+        self._identity = identity
+        self._told_s: float | None = None  # None while there is no such problem
 
-def _is_due(last_s: float | None) -> bool:
-    return last_s is None or time.monotonic() - last_s >= REMIND_PERIOD_S
+    def tell(self, server: WebSocketServer, words: str) -> bool:
+        """List the problem, or none where there are no words; return whether it was told now."""
+        now_s = time.monotonic()
+        if not words and self._told_s is not None:
+            server.remove_status([self._identity])
+            self._told_s = None
+        elif words and (self._told_s is None or now_s - self._told_s >= REMIND_PERIOD_S):
+            self._told_s = now_s
+            server.publish_status(words, StatusLevel.Warning, self._identity)
+            return True
+        return False
 
 
 def _serve(

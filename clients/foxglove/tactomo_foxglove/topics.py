@@ -11,8 +11,8 @@ from typing import Any, Final
 
 import foxglove
 from foxglove import channels
-from tactomo_client import Contact, Frame, Status
-from tactomo_client.schema import HealthIssue, Percentiles, Rates, wire_fields
+from tactomo_client import Contact, Frame
+from tactomo_client.schema import wire_fields
 from tactomo_client.touch import Traces
 
 from tactomo_foxglove import messages
@@ -45,10 +45,6 @@ FRAME_NUMBERS: Final = (
     *("sequence", "scan_counter", "session", "tier", "tier_reason", "flags", "misfit"),
     *("confidence", "skew_ms", "force_n"),
 )
-STATUS_NUMBERS: Final = (
-    *("state", "tier_requested", "uptime_s"),
-    *("frames", "dropped_scans", "incomplete_scans", "late_scans"),
-)
 
 
 def _fields(kind: type, *names: str) -> dict[str, Any]:
@@ -65,18 +61,6 @@ FRAME_SCHEMA: Final = {
         **dict.fromkeys(("flag_count", "contact_count", "missed_frames"), _INTEGER),
         **_numbers("age_ms", "delay_ms", "period_ms", "pressure_max_kpa"),
         contacts=_list(_object(**_fields(Contact), trace=_INTEGER)),
-    ),
-}
-HEALTH_SCHEMA: Final = {
-    "title": "tactomo.Health",
-    **_object(
-        **_fields(Status, *STATUS_NUMBERS),
-        issues=_list(_object(**_fields(HealthIssue))),
-        is_stale=_TRUTH,
-        recording=_TEXT,
-        rates=_object(**_fields(Rates)),
-        latency_ms=_object(**_fields(Percentiles)),
-        age_s=_NUMBER,
     ),
 }
 
@@ -108,7 +92,6 @@ class SensorTopics:
         self._surface = channels.SceneUpdateChannel(topic("surface"), context=context)
         self._grid = channels.GridChannel(topic("grid"), context=context)
         self._frame = foxglove.Channel(topic("frame"), schema=FRAME_SCHEMA, context=context)
-        self._health = foxglove.Channel(topic("health"), schema=HEALTH_SCHEMA, context=context)
         self._events = channels.LogChannel(topic("events"), context=context)
 
     def sheet(self, description: Mapping[str, Any], time_ns: int) -> None:
@@ -130,10 +113,6 @@ class SensorTopics:
         """Show the newest frame as an old one: grey, with `words` over the sheet."""
         self._hang(time_ns)
         self._show(frame, time_ns, words)
-
-    def health(self, fields: Mapping[str, Any], time_ns: int) -> None:
-        """Say how the daemon is."""
-        self._health.log(dict(fields), log_time=time_ns)
 
     def event(self, event: Mapping[str, Any], time_ns: int) -> None:
         """Say that something happened."""

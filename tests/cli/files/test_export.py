@@ -48,7 +48,7 @@ def decoded(path: Path, topic: str) -> list[tuple[int, Any]]:
     """Read a topic by the MCAP and protobuf libraries, and the schemas in the file itself."""
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        if topic.endswith(("/frame", "/health")):
+        if topic.endswith("/frame"):
             plain = reader.iter_messages(topics=[topic])
             return [(message.log_time, json.loads(message.data)) for _, _, message in plain]
         found = reader.iter_decoded_messages(topics=[topic])
