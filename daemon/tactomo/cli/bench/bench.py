@@ -1,7 +1,8 @@
-"""`tactomo bench`: how fast everything is on this machine.
+"""`tactomo bench`: how fast all this is on the machine at hand.
 
-*Live*: a twin and a daemon as processes of their own; what the daemon's status says of its latency,
-its stages and its memory while the twin is pressed in four ways. *Chart* is the laboratory's, see
+*Live*: a twin and a daemon as processes of their own, and this process as the subscriber; latency
+is from the moment at which the daemon has read the last byte of a dual scan to the arrival of its
+contacts here, by the clock that both processes share. *Chart* is the laboratory's, see
 `tactomo.cli.laboratory`.
 """
 
@@ -11,9 +12,11 @@ import os
 import platform
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -22,23 +25,44 @@ from tactomo.cli.laboratory import measurement
 from tactomo.cli.output import print_json, table
 
 if TYPE_CHECKING:
+    from rich.table import Table
+    from tactomo_client import Frame, Subscription
     from tactomo_models import SensorDescription
 
-SETTLE_S: Final = 1.5
-STATUS_S: Final = 13.0  # at 20 dual scans a second: as far back as the times in a status go
-STEP_S: Final = 0.05
-START_S: Final = 60.0
-PLACES: Final = ((0.0, 0.1), (-0.45, -0.4), (0.5, -0.35))  # in shares of half the sheet's size
-SCENES: Final = {
-    "nothing pressed": 0,
-    "one contact, still": 1,
-    "one contact, sliding": 1,
-    "three contacts, still": 3,
-}
-"""How many contacts each has."""
-TOLD: Final = ("frames", "rates", "latency_ms", "stage_ms", "dropped_scans", "process")
-"""What of a status is printed as JSON."""
+    from tactomo.cli.console import Console
+
+SENSOR = "bench"
+SETTLE_S = 1.5
+STATUS_S = 13.0  # at 20 dual scans a second: as far back as the stage times in a status go
+START_S = 60.0
+PLACES = ((0.0, 0.1), (-0.45, -0.4), (0.5, -0.35))  # in shares of half the sheet's size
 LIVE, CHART = "Live", "Speed against accuracy"
+
+
+@dataclass(frozen=True)
+class Phase:
+    """What was measured live while one thing was pressed."""
+
+    scene: str
+    frames: int
+    frames_per_s: float
+    latency_p50_ms: float
+    latency_p99_ms: float
+    stage_ms: dict[str, dict[str, float]]
+    tiers: dict[str, int]
+    memory_mb: float | None
+
+
+@dataclass
+class Results:
+    """Everything that was measured, and on what."""
+
+    machine: str
+    description: str
+    live: list[Phase] = field(default_factory=list)
+    late_scans: int | None = None
+    dropped_scans: int | None = None
+    chart: list[dict[str, Any]] = field(default_factory=list)
 
 
 app = options.typer_app()
@@ -87,9 +111,8 @@ def bench(
 ) -> None:
     """Measure latency and rate on this machine, or the accuracy of methods over their time.
 
-    Starts a twin and a daemon on free addresses, presses the twin in four ways and reads the
-    daemon's status after each. A running demo is not disturbed, but shares the processor. Takes
-    about a minute.
+    Starts a twin and a daemon on free addresses, presses the twin in four ways and measures each. A
+    running demo is not disturbed, but shares the processor. Takes about a minute.
 
     With `--chart`, every method reconstructs simulated presses of mixed kinds on hand-made skins
     (reporting seeds): still scenes at 40, 20 and 10 dB, each from a cold start, and moving scenes,
@@ -98,68 +121,121 @@ def bench(
     """
     if method and chart is None:
         raise typer.BadParameter("--method goes with --chart")
-    about = {"machine": machine(), "description": description}
+    results = Results(machine(), description)
     if chart is not None:
-        rows = measurement("chart")(description, chart, count, about["machine"], method or [])
-        if as_json:
-            print_json({**about, "chart": rows})
+        _chart(results, chart, count, method or [], as_json)
         return
     from tactomo.cli.console import Console
 
     with Console(stderr=True).status("starting") as line:
-        live = _measure_twin(description, ports, rate, seconds, line.update)
+        _measure_twin(results, ports, rate, seconds, line.update)
     if as_json:
-        told = {scene: {name: status[name] for name in TOLD} for scene, status in live.items()}
-        print_json({**about, "live": told})
+        print_json(asdict(results))
     else:
-        _print(about, live)
+        _print(results)
+
+
+def _chart(results: Results, picture: Path, count: int, methods: list[str], as_json: bool) -> None:
+    results.chart = measurement("chart")(
+        results.description, picture, count, results.machine, methods
+    )
+    if as_json:
+        print_json(asdict(results))
 
 
 def _measure_twin(
-    description: str, ports: int | None, rate: float, seconds: float, report: Callable[[str], None]
-) -> dict[str, Mapping[str, Any]]:
-    """Return the daemon's status at the end of each of the scenes."""
-    from tactomo_client import request
+    results: Results, ports: int | None, rate: float, seconds: float, report: Callable[[str], None]
+) -> None:
+    from tactomo_client import request, subscribe
     from tactomo_models import load_description
 
     from tactomo.cli.children import new_family
 
     with tempfile.TemporaryDirectory(prefix="tactomo-") as folder, new_family() as family:
-        twin, control = f"ipc://{folder}/twin", f"ipc://{folder}/control"
-        sheet = load_description(description)
-        described = ("--description", description)
+
+        def at(name: str) -> str:
+            return f"ipc://{folder}/{name}"
+
+        size = load_description(results.description)
+        spots = [_spot(size, place) for place in PLACES]
+        described = ("--description", results.description)
         family.start("models build", "models", "build", *described).wait_done()
         skin = family.start(
             *("twin", "twin", *described, "--rate", str(rate)),
-            *("--twin-control", twin, "--announce"),
+            *("--twin-control", at("twin"), "--announce"),
             *([] if ports is None else ["--ports", str(ports)]),
         ).wait_ready()
         lines = [word for path in skin["ports"] for word in ("--port", path)]
         family.start(
-            *("daemon", "daemon", *described, *lines),
-            *("--stream", f"ipc://{folder}/stream", "--control", control),
+            *("daemon", "daemon", "--sensor", SENSOR, *described, *lines),
+            *("--stream", at("stream"), "--control", at("control")),
         ).wait_ready()
-        end_s = time.monotonic() + START_S
-        while request("status", control)["reference"] is None and time.monotonic() < end_s:
-            time.sleep(STEP_S)
 
-        def press(number: int, place: tuple[float, float]) -> None:
-            x_mm, y_mm = _spot(sheet, place)
-            request("press", twin, id=str(number), x_mm=x_mm, y_mm=y_mm)
+        def press(count: int) -> None:
+            request("clear", skin["control"])
+            for number, (x_mm, y_mm) in enumerate(spots[:count]):
+                request("press", skin["control"], id=str(number), x_mm=x_mm, y_mm=y_mm)
 
-        live: dict[str, Mapping[str, Any]] = {}
-        for scene, count in SCENES.items():
-            report(f"live: {scene}")
-            request("clear", twin)
-            for number, place in enumerate(PLACES[:count]):
-                press(number, place)
-            begin_s, whole_s = time.monotonic(), SETTLE_S + seconds
-            while (passed_s := time.monotonic() - begin_s) < whole_s:
-                if "sliding" in scene:
-                    press(0, (1.2 * passed_s / whole_s - 0.6, 0.2))
-                time.sleep(STEP_S)
-            live[scene] = request("status", control)
-    return live
+        def slide(share: float) -> None:
+            x_mm, y_mm = _spot(size, (1.2 * share - 0.6, 0.2))
+            request("press", skin["control"], id="0", x_mm=x_mm, y_mm=y_mm)
+
+        with subscribe(SENSOR, address=at("stream"), kind="contacts", timeout_s=START_S) as frames:
+            next(frame for frame in frames if "no_reference" not in frame.flags)
+            for scene, count, moves in (
+                ("nothing pressed", 0, None),
+                ("one contact, still", 1, None),
+                ("one contact, sliding", 1, slide),
+                ("three contacts, still", 3, None),
+            ):
+                report(f"live: {scene}")
+                press(count)
+                deque(_during(frames, SETTLE_S), maxlen=0)
+                results.live.append(_measure(frames, scene, seconds, at("control"), moves))
+        results.late_scans = request("status", skin["control"])["late_scans"]
+        results.dropped_scans = request("status", at("control"))["dropped_scans"]
+
+
+def _measure(
+    frames: Subscription[Frame],
+    scene: str,
+    seconds: float,
+    control: str,
+    moves: Callable[[float], None] | None,  # gets the share of the time that has passed
+) -> Phase:
+    import numpy as np
+    from tactomo_client import request
+
+    ages_ms: list[float] = []
+    tiers: Counter[str] = Counter()
+    begin_s = time.monotonic()
+    for frame in _during(frames, seconds):
+        ages_ms.append(frame.age_s * 1e3 - (frame.delay_ns or 0) * 1e-6)
+        tiers[str(frame.tier)] += 1
+        if moves is not None:
+            moves(min(1.0, (time.monotonic() - begin_s) / seconds))
+    passed_s = time.monotonic() - begin_s
+    p50, p99 = np.percentile(ages_ms, (50, 99)).tolist()
+    status = request("status", control)
+    memory_bytes = status["process"]["memory_bytes"]
+    return Phase(
+        scene=scene,
+        frames=len(ages_ms),
+        frames_per_s=len(ages_ms) / passed_s,
+        latency_p50_ms=p50,
+        latency_p99_ms=p99,
+        stage_ms=status["stage_ms"],
+        tiers=dict(tiers),
+        memory_mb=memory_bytes and memory_bytes / 1e6,
+    )
+
+
+def _during(frames: Subscription[Frame], seconds: float) -> Iterator[Frame]:
+    end_s = time.monotonic() + seconds
+    for frame in frames:
+        yield frame
+        if time.monotonic() >= end_s:
+            return
 
 
 def _spot(description: SensorDescription, place: tuple[float, float]) -> tuple[float, float]:
@@ -167,23 +243,53 @@ def _spot(description: SensorDescription, place: tuple[float, float]) -> tuple[f
     return place[0] * description.width_m * 500.0, place[1] * description.height_m * 500.0
 
 
-def _print(about: Mapping[str, str], live: Mapping[str, Mapping[str, Any]]) -> None:
+def _print(results: Results) -> None:
+    console = _console(results)
+    console.print(_live_table(results))
+    console.print(_stage_table(results.live))
+    console.print(
+        f"late scans of the twin: {results.late_scans}; "
+        f"dual scans dropped by the daemon: {results.dropped_scans}"
+    )
+
+
+def _console(results: Results) -> Console:
+    """Return where to print, and say there on what everything was measured."""
     from tactomo.cli.console import page
 
     console = page()
-    console.print(f"{about['machine']}, sensor {about['description']}")
-    shown = table("p50 / p99, ms", *live, title="last byte read to publication, and its stages")
-    whole = {scene: {"latency": status["latency_ms"]} for scene, status in live.items()}
-    times = {scene: {**whole[scene], **status["stage_ms"]} for scene, status in live.items()}
-    for stage in dict.fromkeys(stage for each in times.values() for stage in each):
-        cells = (each.get(stage) for each in times.values())
-        shown.add_row(stage, *(f"{t['p50']:.1f} / {t['p99']:.1f}" if t else "-" for t in cells))
-    console.print(shown)
-    for scene, status in live.items():
-        memory_mb = (status["process"]["memory_bytes"] or 0) / 1e6
-        rate_hz = status["rates"]["frames_hz"]
-        console.print(f"{scene}: {rate_hz:.1f} frames/s, the daemon holds {memory_mb:.0f} MB")
-    console.print(f"dual scans dropped: {status['dropped_scans']}")
+    console.print(f"{results.machine}, sensor {results.description}")
+    return console
+
+
+def _live_table(results: Results) -> Table:
+    methods = "frames by method"
+    shown = table(
+        *("scene", "frames/s", "p50 ms", "p99 ms", "daemon MB", methods),
+        left=(methods,),
+        title="live: last byte read to contacts in another process",
+    )
+    for phase in results.live:
+        shown.add_row(
+            phase.scene,
+            f"{phase.frames_per_s:.1f}",
+            f"{phase.latency_p50_ms:.1f}",
+            f"{phase.latency_p99_ms:.1f}",
+            f"{phase.memory_mb:.0f}" if phase.memory_mb else "-",
+            ", ".join(f"{tier} {count}" for tier, count in phase.tiers.items()),
+        )
+    return shown
+
+
+def _stage_table(phases: list[Phase]) -> Table:
+    """Return the daemon's own account of its newest 256 frames at the end of each scene."""
+    scenes = (phase.scene for phase in phases)
+    shown = table("stage", *scenes, title="stages of the daemon, p50 / p99 ms")
+    for stage in dict.fromkeys(stage for phase in phases for stage in phase.stage_ms):
+        times = (phase.stage_ms.get(stage) for phase in phases)
+        cells = (f"{t['p50']:.1f} / {t['p99']:.1f}" if t else "-" for t in times)
+        shown.add_row(stage, *cells)
+    return shown
 
 
 def machine() -> str:
