@@ -18,7 +18,6 @@ from tactomo.protocols.registry import (
     emulator_of,
     find_protocol,
     protocol_named,
-    recognised,
 )
 
 __all__ = [
@@ -33,5 +32,4 @@ __all__ = [
     "emulator_of",
     "find_protocol",
     "protocol_named",
-    "recognised",
 ]
