@@ -44,9 +44,6 @@ def ports(
             "few bytes, and resets some boards.",
         ),
     ] = False,
-    baud: Annotated[
-        int | None, typer.Option(min=1200, help="Baud rate; USB takes any. [the protocol's usual]")
-    ] = None,
     as_json: JsonOutput = False,
 ) -> None:
     """List serial adapters with their permanent names, the processes that use them, and problems.
@@ -56,7 +53,7 @@ def ports(
     """
     found = survey(paths or [])
     asked = [row.path for row in found if paths or (row.adapter and row.adapter.is_usb)]
-    answers = question(asked, baud) if ask else {}
+    answers = question(asked) if ask else {}
     if as_json:
         print_json({"ports": [as_fields(row, answers) for row in found]})
         return
@@ -90,18 +87,16 @@ def survey(paths: Sequence[str], root: Path = Path("/")) -> list[Row]:
     ]
 
 
-def question(paths: Sequence[str], baud: int | None) -> dict[str, Answer]:
+def question(paths: Sequence[str]) -> dict[str, Answer]:
     """Ask all ports at the same time who is there."""
     from concurrent.futures import ThreadPoolExecutor
 
     from tactomo.acquisition.identify import identify
     from tactomo.protocols import NATIVE, find_protocol
 
-    usual = find_protocol(NATIVE).baud
+    baud = find_protocol(NATIVE).baud
     with ThreadPoolExecutor(max_workers=max(1, len(paths))) as pool:
-        return dict(
-            zip(paths, pool.map(lambda path: identify(path, baud or usual), paths), strict=True)
-        )
+        return dict(zip(paths, pool.map(lambda path: identify(path, baud), paths), strict=True))
 
 
 def as_fields(row: Row, answers: dict[str, Answer]) -> dict[str, Any]:

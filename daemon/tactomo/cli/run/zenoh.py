@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import socket
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
 from tactomo.cli.options import KeysFolder, examples, typer_app
 from tactomo.errors import needs
-
-LogLevel = Literal["debug", "info", "warning", "error"]
-LogFormat = Literal["auto", "text", "json", "journal"]
 
 app = typer_app()
 
@@ -47,15 +44,6 @@ def zenoh(
         ),
     ] = None,
     keys: KeysFolder = None,
-    log_level: Annotated[
-        LogLevel, typer.Option(help="Lowest severity of logged messages.")
-    ] = "info",
-    log_format: Annotated[
-        LogFormat,
-        typer.Option(
-            help="text, json, journal; auto: text on a terminal, journal for journald, else json."
-        ),
-    ] = "auto",
 ) -> None:
     """Carry streams beyond this computer by Eclipse Zenoh, until stopped.
 
@@ -75,7 +63,7 @@ def zenoh(
     from tactomo.log import configure_logging
     from tactomo.stream.relay import serve
 
-    configure_logging(log_level, log_format)
+    configure_logging()
     if bind:
         serve(ZenohProxy(_checked(robot) if robot else "*", _endpoint(bind), config))
     else:
