@@ -189,18 +189,21 @@ def tactomo(
 ) -> Iterator[Callable[..., Outcome]]:
     """Run `tactomo ARGUMENTS` in an empty folder, in this process, and say what became of it.
 
-    Whatever is not told to the user as an error comes out as an exception here.
+    Its exit status is asserted to be `status`, if one is given. Whatever is not told to the user
+    as an error comes out as an exception here.
     """
     before = {number: signal.getsignal(number) for number in (*ASKED, *AS_WELL)}
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
 
-    def run(*arguments: object) -> Outcome:
+    def run(*arguments: object, status: int | None = None) -> Outcome:
         monkeypatch.setattr("sys.argv", ["tactomo", *map(str, arguments)])
         capsys.readouterr()
         with pytest.raises(SystemExit) as exit_:
             main()
-        return Outcome(int(exit_.value.code or 0), *capsys.readouterr())
+        outcome = Outcome(int(exit_.value.code or 0), *capsys.readouterr())
+        assert status in (None, outcome.returncode), outcome
+        return outcome
 
     yield run
     for number, handler in before.items():

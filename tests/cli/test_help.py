@@ -6,12 +6,12 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fixture_types import Run
 from tactomo.cli import app, commands
 from tactomo.cli.options import (
     DEFAULT_CONTROL,
@@ -27,7 +27,6 @@ from tactomo_models import shipped_descriptions
 from typer.main import get_command
 from typer.testing import CliRunner
 
-Run = Callable[..., Any]
 TOP: Any = get_command(app)
 HEAVY = {"numpy", "scipy", "zmq", "pydantic", "aiohttp", "serial", "skfem", "matplotlib", "rich"}
 HEAVY |= {"asyncio", "structlog"}
@@ -162,16 +161,14 @@ def test_without_the_laboratory_it_says_how_to_get_it(
 ) -> None:
     monkeypatch.setattr(commands, "_entry_points", dict)
     for words in (["evaluate", "field"], ["models", "train"]):
-        result = tactomo(*words)
-        assert result.returncode == 1
+        result = tactomo(*words, status=1)
         assert "is part of the laboratory, which is not installed" in result.stderr
         assert "pip install tactomo-lab" in result.stderr
     assert "evaluate" not in tactomo("--help").stdout
 
 
 def test_without_a_command_it_shows_the_help(tactomo: Run) -> None:
-    result = tactomo()
-    assert result.returncode == 2
+    result = tactomo(status=2)
     assert "tactomo demo" in result.stdout + result.stderr
     version = tactomo("--version")
     assert (version.returncode, version.stdout[:10]) == (0, "tactomo 0.")
@@ -190,8 +187,7 @@ def test_without_a_command_it_shows_the_help(tactomo: Run) -> None:
     ],
 )
 def test_wrong_usage_exits_with_2(tactomo: Run, arguments: list[str]) -> None:
-    result = tactomo(*arguments)
-    assert result.returncode == 2
+    result = tactomo(*arguments, status=2)
     assert result.stdout == ""
 
 
@@ -204,7 +200,6 @@ def test_the_default_addresses_are_the_clients() -> None:
 def test_every_key_of_the_configuration_can_be_set(tactomo: Run) -> None:
     """Given a table, which none of these takes, each is refused for its value and not its name."""
     for key in DaemonConfig.model_fields.keys() - {"baseline", "curve", "recording"}:
-        result = tactomo("daemon", "--set", f"{key}.is=1")
-        assert result.returncode == 1
+        result = tactomo("daemon", "--set", f"{key}.is=1", status=1)
         assert f"command line: {key}" in result.stderr
         assert "unknown" not in result.stderr, key

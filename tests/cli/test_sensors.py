@@ -6,18 +6,17 @@ import contextlib
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from fake_control import FakeControl
+from fixture_types import Run
 from tactomo.cli.sensors import twin_of
 from tactomo.endpoint import free_addresses
 from tactomo.running import Running, announced, running
 from tactomo_client.fake import FakeSensor
 from waiting import PATIENCE_S, repeated
-
-Run = Callable[..., Any]
 
 HOLDER = """
 import sys, time
@@ -50,8 +49,8 @@ def telling(sensor: str, **status: Any) -> Iterator[FakeSensor]:
 def test_the_only_sensor_is_found(tactomo: Run) -> None:
     with FakeControl({"tare": {"scans": 20}}) as control:
         with announcing(Running("daemon", control.address, "left")):
-            assert tactomo("tare").returncode == 0
-            assert tactomo("tare", "--sensor", "left").returncode == 0
+            tactomo("tare", status=0)
+            tactomo("tare", "--sensor", "left", status=0)
         assert running("daemon") == []
     assert [command for command, _ in control.requests] == ["status", "tare"] * 2
 
@@ -63,12 +62,11 @@ def test_several_are_listed_and_one_is_asked_for(tactomo: Run, monkeypatch: Any)
             Running("daemon", right.address, "right", "tcp://127.0.0.1:2"),
         ]
         with announcing(*each):
-            told = tactomo("tare")
-            assert told.returncode == 1
+            told = tactomo("tare", status=1)
             assert "left at tcp://127.0.0.1:1, of /dev/ttyACM0\n" in told.stderr
             assert "2 run on this computer; choose one by --sensor NAME:\n" in told.stderr
             monkeypatch.setenv("TACTOMO_SENSOR", "left")
-            assert tactomo("tare").returncode == 0
+            tactomo("tare", status=0)
     assert right.requests == []
 
 
@@ -84,8 +82,7 @@ def test_two_of_a_name_are_told_by_their_addresses(tactomo: Run) -> None:
     "command", [("status",), ("watch",), ("tare",), ("doctor",), ("foxglove",)]
 )
 def test_where_none_runs_it_says_how_to_start_one(tactomo: Run, command: tuple[str]) -> None:
-    told = tactomo(*command)
-    assert told.returncode == 1
+    told = tactomo(*command, status=1)
     assert "no sensor runs on this computer; start one by `tactomo daemon`" in told.stderr
 
 
@@ -93,7 +90,7 @@ def test_a_command_goes_to_the_daemon_whose_stream_is_given(tactomo: Run, monkey
     answers: dict[str, Any] = {"status": {"sensor": "palm"}, "tare": {"scans": 20}}
     with FakeControl(answers) as control, telling("palm", control=control.address) as fake:
         monkeypatch.setenv("TACTOMO_ADDRESS", fake.address)
-        assert tactomo("tare").returncode == 0
+        tactomo("tare", status=0)
         control.answers["status"] = {"sensor": "sole"}
         told = tactomo("tare")
     assert told.returncode == 1

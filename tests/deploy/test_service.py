@@ -8,18 +8,17 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fixture_types import Run
 from tactomo.acquisition import udev
 from tactomo.acquisition.adapters import Adapter
 from tactomo.config import load_config, load_skins
 from tactomo.errors import ServiceError
 from tactomo.service import installation
 
-Run = Callable[..., Any]
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"
 EXAMPLES = sorted((DEPLOY / "examples").glob("*.toml"))
@@ -100,7 +99,7 @@ def test_a_configuration_is_its_owners_and_survives(install: Run, tactomo: Run, 
     config = disk / "etc/tactomo/palm.toml"
     config.write_text(mine := 'ports = ["/dev/ttyACM7"]\n')
     assert f"keep       {config}" in install("palm", "/dev/ttyACM0").stdout
-    assert tactomo("service", "uninstall", "--root", disk).returncode == 0
+    tactomo("service", "uninstall", "--root", disk, status=0)
     left = {path.relative_to(disk) for path in files_of(disk / "etc") if "tactomo" in str(path)}
     assert left == {Path("etc/tactomo/palm.toml")}
     assert config.read_text() == mine
@@ -144,15 +143,13 @@ def test_what_stands_in_the_way_is_said(tactomo: Run, monkeypatch: pytest.Monkey
     here = ("--port", "/dev/ttyACM0", "--program", PROGRAM)
     assert "letters, digits" in tactomo("service", "install", "left arm", *here).stderr
     if not Path("/run/systemd/system").exists():
-        said = tactomo("service", "install", "palm", *here)
-        assert said.returncode == 1
+        said = tactomo("service", "install", "palm", *here, status=1)
         assert "this computer does not run systemd" in said.stderr
     for place in ("/home/me/venv/bin/python", "/root/.pyenv/bin/python"):
         monkeypatch.setattr("sys.executable", place)
         with pytest.raises(ServiceError, match="does not see"):
             installation.this_program()
-    look = tactomo("service", "install", "palm", "--port", "/dev/ttyACM0", "--dry-run")
-    assert look.returncode == 0
+    look = tactomo("service", "install", "palm", "--port", "/dev/ttyACM0", "--dry-run", status=0)
     assert "does not see" in look.stderr
     assert "tactomo@palm.service" in look.stdout
 

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from daemon_process import DaemonProcess
 from ears import Ears
-from pty_skin import Playing, PtySkin, Scenes, still
+from fixture_types import Figure, Listen, Play, StartProcess
+from pty_skin import PtySkin, Scenes, still
 from tactomo_client.messages import array_from_wire
 from tactomo_protocol import Channel, encode
 from waiting import wait_until
-
-Start = Callable[..., DaemonProcess]
-Play = Callable[..., Playing]
-Listen = Callable[..., Ears]
-Figure = Callable[[str], None]
 
 BACK_S = 1.0
 
@@ -62,7 +57,7 @@ def unplug_and_replug(times: int, daemon: DaemonProcess, skin: PtySkin, ears: Ea
     "20 dual scans/s",
 )
 def test_unplugged_and_replugged(
-    tared: Start, skin: PtySkin, scenes: Scenes, play: Play, listen: Listen, figure: Figure
+    tared: StartProcess, skin: PtySkin, scenes: Scenes, play: Play, listen: Listen, figure: Figure
 ) -> None:
     daemon = tared()
     ears = listen(daemon)
@@ -127,7 +122,7 @@ class Corrupter:
     "500 dual scans at 100/s, with random bytes in place of sent bytes",
 )
 def test_corrupted_bytes(
-    tared: Start,
+    tared: StartProcess,
     skin: PtySkin,
     scenes: Scenes,
     listen: Listen,
@@ -206,7 +201,7 @@ def test_corrupted_bytes(
     "random bytes as fast as they are read, the other port at 20 scans/s",
 )
 def test_a_burst_of_noise(
-    tared: Start, skin: PtySkin, scenes: Scenes, listen: Listen, play: Play, figure: Figure
+    tared: StartProcess, skin: PtySkin, scenes: Scenes, listen: Listen, play: Play, figure: Figure
 ) -> None:
     daemon = tared()
     ears = listen(daemon)
@@ -248,7 +243,7 @@ def test_a_burst_of_noise(
     "both ports, 20 dual scans/s before and after",
 )
 def test_a_device_of_no_use(
-    tared: Start,
+    tared: StartProcess,
     skin: PtySkin,
     scenes: Scenes,
     listen: Listen,

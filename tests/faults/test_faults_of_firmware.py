@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import zenoh
 from daemon_process import SENSOR, DaemonProcess
+from fixture_types import Figure, StartProcess
 from foxglove_client import FoxgloveClient
 from hostile_board import HostileBoard
 from pty_skin import PtySkin, Scenes
@@ -20,9 +21,6 @@ from tactomo_client import subscribe
 from tactomo_models import SensorDescription
 from tactomo_ros2.live import run
 from waiting import PATIENCE_S, wait_until
-
-Start = Callable[..., DaemonProcess]
-Figure = Callable[[str], None]
 
 SHORT_S = 60.0
 LONG_S = 3600.0
@@ -65,7 +63,7 @@ def test_a_hostile_board(
     tmp_path: Path,
     description: SensorDescription,
     scenes: Scenes,
-    start: Start,
+    start: StartProcess,
     figure: Figure,
     scale: float,
     ports: int,
@@ -147,7 +145,7 @@ def test_a_door_beside_a_hostile_board(
     tmp_path: Path,
     skin: PtySkin,
     scenes: Scenes,
-    start: Start,
+    start: StartProcess,
     figure: Figure,
     door: Callable[[str, Path], AbstractContextManager[Count]],
 ) -> None:

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from daemon_process import DaemonProcess
-from ears import Ears, percentiles
-from pty_skin import Playing, PtySkin, Scenes, moving, still
+from ears import percentiles
+from fixture_types import Figure, Listen, Play, StartProcess
+from pty_skin import PtySkin, Scenes, moving, still
 from tactomo.recordings.recording import open_recording
 from waiting import wait_until
-
-Start = Callable[..., DaemonProcess]
-Play = Callable[..., Playing]
-Listen = Callable[..., Ears]
-Figure = Callable[[str], None]
 
 STOPPED_S = 5.0
 OVERLOAD_S = 15.0
@@ -48,7 +43,7 @@ def at_rest(daemon: DaemonProcess) -> dict[str, Any]:
     "daemon publishes when flooded",
 )
 def test_ten_times_too_fast(
-    tared: Start, skin: PtySkin, scenes: Scenes, play: Play, listen: Listen, figure: Figure
+    tared: StartProcess, skin: PtySkin, scenes: Scenes, play: Play, listen: Listen, figure: Figure
 ) -> None:
     daemon = tared()
     flood = play(moving(scenes.two[::7]), 300.0)
@@ -85,7 +80,7 @@ def test_ten_times_too_fast(
     "time of sending",
 )
 def test_the_daemon_is_stopped_for_a_while(
-    tared: Start, scenes: Scenes, play: Play, listen: Listen, figure: Figure
+    tared: StartProcess, scenes: Scenes, play: Play, listen: Listen, figure: Figure
 ) -> None:
     daemon = tared()
     ears = listen(daemon)
@@ -120,7 +115,7 @@ def test_the_daemon_is_stopped_for_a_while(
     "two contacts that jump at 300 dual scans/s, recording with maps, a subscriber to all",
 )
 def test_sigterm_under_full_load(
-    tared: Start, scenes: Scenes, play: Play, listen: Listen, figure: Figure, tmp_path: Path
+    tared: StartProcess, scenes: Scenes, play: Play, listen: Listen, figure: Figure, tmp_path: Path
 ) -> None:
     path = tmp_path / "load.mcap"
     daemon = tared(recording={"file": str(path), "maps": True})

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zmq
+from fixture_types import Figure
 from hostile_page import SUBSCRIBE, Attacker, HostileSite
 from selenium import webdriver
 from tactomo.cli.children import Family
@@ -17,7 +18,6 @@ from tactomo_client.messages import encode_request
 from waiting import PATIENCE_S
 from whole_system import ANYWHERE, SENSOR
 
-Figure = Callable[[str], None]
 SET_TIER = [b"", encode_request("set_tier", {"tier": "noser"})]
 PRESS = [b"", encode_request("press", {"x_mm": 0.0, "y_mm": 0.0})]
 PROTOCOL = "foxglove.sdk.v1"

@@ -16,16 +16,12 @@ import numpy as np
 import pytest
 import zmq
 from daemon_process import SENSOR, DaemonProcess
-from ears import Ears, percentiles
-from pty_skin import Playing, Scenes, still
+from ears import percentiles
+from fixture_types import Figure, Listen, Play, StartProcess
+from pty_skin import Scenes, still
 from tactomo_client import request
 from tactomo_client.messages import decode_message, topic
 from waiting import wait_until
-
-Start = Callable[..., DaemonProcess]
-Play = Callable[..., Playing]
-Listen = Callable[..., Ears]
-Figure = Callable[[str], None]
 
 STOPPED_S = 20.0
 SUBSCRIBERS = 200
@@ -67,7 +63,7 @@ def subscriber() -> Iterator[Callable[[DaemonProcess], subprocess.Popen[str]]]:
     "maps at 100/s, 3 MB/s, to two processes of the Python client",
 )
 def test_a_stopped_subscriber(
-    tared: Start,
+    tared: StartProcess,
     scenes: Scenes,
     play: Play,
     listen: Listen,
@@ -114,7 +110,7 @@ def test_a_stopped_subscriber(
     "maps at 20/s to 200 sockets, 120 MB/s in all; age on arrival at the last socket",
 )
 def test_many_subscribers(
-    tared: Start, scenes: Scenes, play: Play, listen: Listen, figure: Figure
+    tared: StartProcess, scenes: Scenes, play: Play, listen: Listen, figure: Figure
 ) -> None:
     daemon = tared()
     rss_mb = daemon.rss_mb
@@ -162,7 +158,7 @@ def test_many_subscribers(
     "one socket as fast as it can, then 500 connections opened and closed",
 )
 def test_a_fickle_subscriber(
-    tared: Start, scenes: Scenes, play: Play, listen: Listen, figure: Figure
+    tared: StartProcess, scenes: Scenes, play: Play, listen: Listen, figure: Figure
 ) -> None:
     daemon = tared()
     ears = listen(daemon)
@@ -223,7 +219,7 @@ def rubbish(rng: np.random.Generator) -> Iterator[list[bytes]]:
     "to the stream, and random bytes instead of ZeroMQ to both ports",
 )
 def test_garbage_on_the_sockets(
-    tared: Start, scenes: Scenes, play: Play, listen: Listen, figure: Figure
+    tared: StartProcess, scenes: Scenes, play: Play, listen: Listen, figure: Figure
 ) -> None:
     daemon = tared()
     ears = listen(daemon)

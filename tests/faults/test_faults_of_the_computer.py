@@ -11,16 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tactomo_models
-from daemon_process import DaemonProcess
-from ears import Ears
-from pty_skin import Playing, Scenes, moving
+from fixture_types import Figure, Listen, Play, StartProcess
+from pty_skin import Scenes, moving
 from tactomo.recordings.recording import open_recording
 from tactomo_protocol import Decoder, Scan
-
-Start = Callable[..., DaemonProcess]
-Play = Callable[..., Playing]
-Listen = Callable[..., Ears]
-Figure = Callable[[str], None]
 
 KILLS = 10
 
@@ -44,7 +38,7 @@ def counters(path: Path) -> set[int]:
 )
 @pytest.mark.parametrize("loops", [0, 4])
 def test_killed_while_recording(
-    tared: Start,
+    tared: StartProcess,
     scenes: Scenes,
     play: Play,
     busy: Callable[[int], None],
@@ -80,7 +74,7 @@ def test_killed_while_recording(
     "all .onnx files deleted from a copy of the models' package, then the daemon restarted",
 )
 def test_the_networks_vanish(
-    tared: Start, scenes: Scenes, play: Play, listen: Listen, figure: Figure, tmp_path: Path
+    tared: StartProcess, scenes: Scenes, play: Play, listen: Listen, figure: Figure, tmp_path: Path
 ) -> None:
     copy = tmp_path / "models" / "tactomo_models"
     copy.parent.mkdir()

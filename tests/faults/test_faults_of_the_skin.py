@@ -5,25 +5,18 @@ from __future__ import annotations
 import itertools
 import time
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from daemon_process import DaemonProcess
-from ears import Ears
+from fixture_types import Figure, Listen, Play, StartProcess
 from pty_skin import Playing, PtySkin, Scenes, moving, still
 from tactomo_models import Press, SensorDescription, SkinSimulator
 from tactomo_models.arrays import FloatArray
 from tactomo_protocol import Channel, Scan
 from waiting import wait_until
-
-Start = Callable[..., DaemonProcess]
-Play = Callable[..., Playing]
-Listen = Callable[..., Ears]
-Figure = Callable[[str], None]
 
 PALM_S, PALM_KPA, PALM_RADIUS_M = 30.0, 20.0, 0.04
 
@@ -36,7 +29,7 @@ PALM_S, PALM_KPA, PALM_RADIUS_M = 30.0, 20.0, 0.04
     "20 dual scans/s for 10 s after a tare",
 )
 def test_a_frozen_converter(
-    tared: Start,
+    tared: StartProcess,
     skin: PtySkin,
     scenes: Scenes,
     play: Play,
@@ -79,7 +72,7 @@ def test_two_skins_on_one_daemon(
     tmp_path: Path,
     description: SensorDescription,
     scenes: Scenes,
-    start: Start,
+    start: StartProcess,
     listen: Listen,
     figure: Figure,
 ) -> None:
@@ -114,7 +107,7 @@ def test_two_skins_on_one_daemon(
     "a contact of 180 kPa is held, tared and released, 20 dual scans/s",
 )
 def test_a_tare_under_a_press(
-    tared: Start, scenes: Scenes, play: Play, listen: Listen, figure: Figure
+    tared: StartProcess, scenes: Scenes, play: Play, listen: Listen, figure: Figure
 ) -> None:
     daemon = tared()
     ears = listen(daemon)
@@ -143,7 +136,7 @@ def test_a_tare_under_a_press(
     "the pressure rises evenly, 20 dual scans/s; frames counted by their number of contacts",
 )
 def test_a_palm_that_comes_lightly(
-    tared: Start,
+    tared: StartProcess,
     skin: PtySkin,
     description: SensorDescription,
     play: Play,

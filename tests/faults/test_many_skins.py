@@ -5,16 +5,15 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from ears import Ears
+from fixture_types import Figure
 from processes import children_of
 from pty_skin import Scenes, moving
 from robot import Robot
-
-Figure = Callable[[str], None]
 
 SKINS = tuple(f"skin{number}" for number in range(10))
 RATE_HZ = 20.0

@@ -12,17 +12,13 @@ from pathlib import Path
 
 import pytest
 import zmq
-from daemon_process import SENSOR, DaemonProcess
-from ears import Ears, percentiles
+from daemon_process import SENSOR
+from ears import percentiles
+from fixture_types import Figure, Listen, Play, StartProcess
 from pty_skin import Playing, PtySkin, Scenes, Volts, moving, still
 from stream_rules import Subscriber
 from tactomo_client.messages import decode_message, topic
 from waiting import wait_until
-
-Start = Callable[..., DaemonProcess]
-Play = Callable[..., Playing]
-Listen = Callable[..., Ears]
-Figure = Callable[[str], None]
 
 SETTLE_S = 3.0
 IDLE_S = 60.0
@@ -75,7 +71,7 @@ CASES = [
     "see above",
 )
 def test_latency(
-    tared: Start,
+    tared: StartProcess,
     scenes: Scenes,
     play: Play,
     listen: Listen,
@@ -147,7 +143,7 @@ def a_third_of_a_core() -> Iterator[None]:
     "user and system time of the whole process over 60 s, one subscriber to contacts",
 )
 def test_idle_processor_time(
-    tared: Start,
+    tared: StartProcess,
     scenes: Scenes,
     play: Play,
     listen: Listen,
@@ -212,7 +208,7 @@ def wait_for_sent(playing: Playing, scans: int) -> None:
     "contact",
 )
 def test_soak(
-    tared: Start, skin: PtySkin, scenes: Scenes, play: Play, figure: Figure, scale: float
+    tared: StartProcess, skin: PtySkin, scenes: Scenes, play: Play, figure: Figure, scale: float
 ) -> None:
     daemon = tared(lossless=True)
     newest = Newest(daemon.stream)

@@ -52,38 +52,27 @@ HEADER: Mapping[str, Any] = {
 
 
 class Publishing:
-    """A sensor that publishes the same frame again and again until it is told to pause."""
+    """A sensor that publishes the same frame again and again unless it is paused."""
 
-    def __init__(self, sensor: FakeSensor, number: int = PRESSED) -> None:
+    def __init__(self, sensor: FakeSensor) -> None:
         self.sensor = sensor
-        self.number = number
         self.paused = False
-        self.also: queue.SimpleQueue[bytes] = queue.SimpleQueue()  # the socket is this thread's
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
+        self.also: queue.SimpleQueue[bytes] = queue.SimpleQueue()  # the socket is its thread's
 
-    def _run(self) -> None:
-        while not self._stop.wait(0.01):
-            self.sensor.publish_message("status", STATUS)
-            while not self.also.empty():
-                self.sensor.send(self.also.get())
-            if not self.paused:
-                images: Mapping[str, Any] = images_of(self.number)
-                self.sensor.publish(contacts_of(self.number), **images)
-
-    def stop(self) -> None:
-        self._stop.set()
-        self._thread.join()
+    def say(self) -> None:
+        self.sensor.publish_message("status", STATUS)
+        while not self.also.empty():
+            self.sensor.send(self.also.get())
+        if not self.paused:
+            images: Mapping[str, Any] = images_of(PRESSED)
+            self.sensor.publish(contacts_of(PRESSED), **images)
 
 
 @contextmanager
-def publishing(sensor: FakeSensor, number: int = PRESSED) -> Iterator[Publishing]:
-    running = Publishing(sensor, number)
-    try:
-        yield running
-    finally:
-        running.stop()
+def publishing(sensor: FakeSensor) -> Iterator[Publishing]:
+    source = Publishing(sensor)
+    with repeated(source.say, 0.01):
+        yield source
 
 
 @contextmanager
@@ -309,17 +298,18 @@ def test_the_command_serves_until_it_is_stopped(sensor: FakeSensor, tmp_path: Pa
 
 def test_without_the_extra(tactomo: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "foxglove", None)
-    result = tactomo("foxglove")
-    assert result.returncode == 1
+    result = tactomo("foxglove", status=1)
     assert "pip install 'tactomo[foxglove]'" in result.stderr
 
 
 def test_wrong_usage(tactomo: Callable[..., Any]) -> None:
     began = time.monotonic()
     result = tactomo(
-        *("foxglove", "left", "--address", "tcp://127.0.0.1:9"), "--layout", "nowhere/skin.json"
+        *("foxglove", "left", "--address", "tcp://127.0.0.1:9"),
+        "--layout",
+        "nowhere/skin.json",
+        status=1,
     )
-    assert result.returncode == 1
     assert "cannot write nowhere/skin.json" in result.stderr
     assert time.monotonic() - began < 10
 

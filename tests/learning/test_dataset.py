@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from fixture_types import Run
 from recorded_grasp import (
     FIRST_PRESSED,
     FRAMES,
@@ -27,7 +28,6 @@ from tactomo_client.touch import CONTACT_COLUMNS
 pytestmark = pytest.mark.peers
 pytest.importorskip("lerobot", reason="make test-peers installs LeRobot")
 
-Run = Callable[..., Any]
 TOUCH = f"observation.tactile.{SENSOR}"
 FPS = 20
 AGE_S = 0.007
@@ -62,8 +62,9 @@ def write_steps(path: Path, times_s: Iterable[float], clock: str = "monotonic_s"
 
 def test_maps_and_contacts_are_the_recorded_ones(tactomo: Run, tmp_path: Path) -> None:
     write_grasp(tmp_path / "grasp.mcap")
-    result = tactomo("export", "grasp.mcap", "set", "--lerobot", "--fps", FPS, "--task", "hold")
-    assert result.returncode == 0, result.stderr
+    result = tactomo(
+        "export", "grasp.mcap", "set", "--lerobot", "--fps", FPS, "--task", "hold", status=0
+    )
     assert "80 steps" in result.stdout
     dataset = opened(tmp_path / "set")
     assert (dataset.num_frames, dataset.num_episodes, dataset.fps) == (FRAMES, 1, FPS)
@@ -103,8 +104,7 @@ def test_steps_of_a_robot_have_what_it_could_have_known(tactomo: Run, tmp_path: 
     times = write_steps(
         tmp_path / "steps.csv", [start_s + n / 30 for n in range(100) if n not in (50, 51)]
     )
-    result = tactomo("export", "grasp.mcap", "set", "--lerobot", "--robot", "steps.csv")
-    assert result.returncode == 0, result.stderr
+    result = tactomo("export", "grasp.mcap", "set", "--lerobot", "--robot", "steps.csv", status=0)
     assert "2 steps are missing in the robot's log at 30 a second" in result.stderr
     assert "steps repeat the frame of the step before" in result.stderr
     assert "1 steps have no frame younger than 0.5 s" in result.stderr  # the very first
@@ -131,8 +131,7 @@ def test_steps_of_a_robot_have_what_it_could_have_known(tactomo: Run, tmp_path: 
 def test_dropped_frames_leave_gaps_and_are_counted(tactomo: Run, tmp_path: Path) -> None:
     """A second without frames: for half of it the last one stands, with its age; then nothing."""
     write_grasp(tmp_path / "grasp.mcap", [n for n in range(FRAMES) if not 30 <= n < 50])
-    result = tactomo("export", "grasp.mcap", "set", "--lerobot", "--fps", FPS)
-    assert result.returncode == 0, result.stderr
+    result = tactomo("export", "grasp.mcap", "set", "--lerobot", "--fps", FPS, status=0)
     assert "20 frames were published that the recording does not hold" in result.stderr
     assert "steps have no frame younger than 0.5 s" in result.stderr
     table = stored(tmp_path / "set")
@@ -161,8 +160,7 @@ def test_a_log_that_cannot_be_right_is_refused(
 ) -> None:
     write_grasp(tmp_path / "grasp.mcap")
     (tmp_path / "steps.csv").write_text(lines)
-    result = tactomo("export", "grasp.mcap", "set", "--lerobot", "--robot", "steps.csv")
-    assert result.returncode == 1
+    result = tactomo("export", "grasp.mcap", "set", "--lerobot", "--robot", "steps.csv", status=1)
     assert says in result.stderr.replace("\n", " ")
     assert not (tmp_path / "set").exists()
 
@@ -176,10 +174,9 @@ def test_a_wall_clock_that_was_set_does_not_align(tactomo: Run, tmp_path: Path) 
     begin_s = START_NS * 1e-9
     write_steps(tmp_path / "steps.csv", [begin_s + n / 20 for n in range(100)], "realtime_s")
     arguments = ("export", "grasp.mcap", "set", "--lerobot", "--robot", "steps.csv")
-    result = tactomo(*arguments)
-    assert result.returncode == 1
+    result = tactomo(*arguments, status=1)
     assert "-3600.000 s" in result.stderr
-    assert tactomo(*arguments, "--to", 1.4).returncode == 0  # before it, it does
+    tactomo(*arguments, "--to", 1.4, status=0)  # before it, it does
     row = opened(tmp_path / "set")[22]
     np.testing.assert_array_equal(
         row[f"{TOUCH}.pressure_kpa"].numpy(), images_of(21)["pressure_kpa"]

@@ -89,7 +89,7 @@ def test_ros_reads_the_bags(tactomo: Any, tmp_path: Path) -> None:
     types = (PointCloud2, WrenchStamped, PoseWithCovarianceStamped, DiagnosticArray)
     by_name = {kind.__name__: kind for kind in types}
     write_grasp(tmp_path / "grasp.mcap")
-    assert tactomo("export", "grasp.mcap", "bag", "--ros2").returncode == 0
+    tactomo("export", "grasp.mcap", "bag", "--ros2", status=0)
     counts = dict.fromkeys(by_name, 0)
     with (tmp_path / "bag/bag.mcap").open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():

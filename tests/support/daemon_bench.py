@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import zmq
@@ -322,13 +322,14 @@ class Bench:
         """Wait for the condition and return its value."""
         return wait_until(condition)
 
-    def tare(self) -> None:
-        """Say hello and send the scans of the first reference."""
+    def tare(self) -> Self:
+        """Say hello and send the scans of the first reference; returns itself."""
         self.skin.introduce()
         whole = 0  # a busy computer may tear one of a short wait for the other channel apart
         while whole < self.daemon.config.tare_scans:
             whole += not {"magnitude_missing", "structure_missing"} & set(self.step()["flags"])
         self.listener.event("tared")
+        return self
 
     def step(self, load: float = 0.0, **details: Any) -> dict[str, Any]:
         """Send one dual scan and wait for its map."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pytest
@@ -48,9 +48,10 @@ class Host:
     def send(self, code: int, request: int = 1, rate_hz: float = 0.0, port: int = 0) -> None:
         self.ports[port].write(encode(Command(code, request, rate_hz)))
 
-    def start(self) -> None:
+    def start(self) -> Self:
         for port in range(len(self.ports)):
             self.send(CommandCode.START, port=port)
+        return self
 
     def read(self) -> None:
         for port, decoder, packets in zip(self.ports, self.decoders, self.packets, strict=True):

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import serial
+from fixture_types import Start
 from hostile_page import post
 from small_sensor import SMALL
 from tactomo.errors import AddressError, ConfigError, TactomoError
@@ -34,8 +35,6 @@ from tactomo_protocol import (
     ScanFlag,
 )
 from waiting import PATIENCE_S, wait_until
-
-Start = Callable[..., Any]
 
 
 def volts(host: Any, scan: Scan, port: int = 0) -> float:
@@ -71,8 +70,7 @@ def test_hello_repeats_unasked(bench: Start) -> None:
 
 
 def test_one_port_carries_both_channels_of_the_same_instant(bench: Start) -> None:
-    host = bench().host()
-    host.start()
+    host = bench().host().start()
     host.wait_for(lambda: len(host.scans()) >= 10)
     for first, second in zip(host.scans()[0:10:2], host.scans()[1:10:2], strict=True):
         assert (first.channel, second.channel) == (Channel.MAGNITUDE, Channel.STRUCTURE)
@@ -113,8 +111,7 @@ def test_two_ports_share_counter_and_stamp_and_each_starts_by_itself(bench: Star
 
 
 def test_scans_keep_the_rate_on_the_devices_clock(bench: Start) -> None:
-    host = bench(rate_hz=50.0).host()
-    host.start()
+    host = bench(rate_hz=50.0).host().start()
     host.wait_for(lambda: len(host.scans()) >= 80)
     stamps_us = np.array([s.device_us for s in host.scans() if s.channel == Channel.MAGNITUDE])
     assert np.all(np.diff(stamps_us) > 0)
@@ -125,8 +122,7 @@ def test_scans_keep_the_rate_on_the_devices_clock(bench: Start) -> None:
 
 
 def test_rate_stop_and_zero_counters(bench: Start) -> None:
-    host = bench().host()
-    host.start()
+    host = bench().host().start()
     host.wait_for(lambda: host.scans() and host.scans()[-1].counter > 5)
     host.send(CommandCode.SET_RATE, 3, rate_hz=200.0)
     host.wait_for(lambda: any(hello.scan_rate_hz == 200.0 for hello in host.kind(Hello)))
@@ -141,8 +137,7 @@ def test_rate_stop_and_zero_counters(bench: Start) -> None:
 
 
 def test_a_scan_that_takes_longer_is_late_and_says_so(bench: Start) -> None:
-    host = bench(solve_s=0.15, rate_hz=10.0).host()
-    host.start()
+    host = bench(solve_s=0.15, rate_hz=10.0).host().start()
     host.wait_for(lambda: len(host.scans()) >= 6)
     assert all(scan.flags & ScanFlag.LATE for scan in host.scans())
     steps = np.diff([s.device_us for s in host.scans() if s.channel == Channel.MAGNITUDE])
@@ -164,8 +159,7 @@ class StallingSkin:
 
 
 def test_scans_missed_in_a_stall_are_not_made_up(bench: Start) -> None:
-    host = bench(StallingSkin(), rate_hz=100.0).host()
-    host.start()
+    host = bench(StallingSkin(), rate_hz=100.0).host().start()
     host.wait_for(lambda: len(host.scans()) >= 60)
     stamps_us = np.array([s.device_us for s in host.scans() if s.channel == Channel.MAGNITUDE])
     assert stamps_us[1] - stamps_us[0] >= 500_000
@@ -190,8 +184,7 @@ def test_a_program_that_knows_nothing_of_terminals_reads_the_bytes_as_they_are(
 
 def test_a_scan_in_time_is_not_late(bench: Start) -> None:
     started = bench(rate_hz=2.0)
-    host = started.host()
-    host.start()
+    host = started.host().start()
 
     def late() -> list[bool]:
         return [bool(scan.flags & ScanFlag.LATE) for scan in host.scans()]
@@ -216,8 +209,7 @@ class WaitingSkin:
 
 def test_acknowledgements_do_not_wait_for_a_slow_solve(bench: Start) -> None:
     skin = WaitingSkin()
-    host = bench(skin, rate_hz=10.0).host()
-    host.start()
+    host = bench(skin, rate_hz=10.0).host().start()
     host.wait_for(lambda: host.kind(Acknowledge))
     host.send(CommandCode.IDENTIFY, request=9)
     host.wait_for(lambda: len(host.kind(Acknowledge)) == 2)
@@ -228,8 +220,7 @@ def test_acknowledgements_do_not_wait_for_a_slow_solve(bench: Start) -> None:
 
 def test_a_live_press_shows_until_it_is_released(bench: Start) -> None:
     started = bench()
-    host = started.host()
-    host.start()
+    host = started.host().start()
     host.wait_for(lambda: host.scans() and host.kind(Hello))
     started.ask("press", id="a", x_mm=10.0, y_mm=-5.0, pressure_kpa=150.0)
     started.ask("press", id="b", x_mm=0.0, y_mm=0.0, pressure_kpa=50.0)
@@ -261,8 +252,7 @@ def test_a_script_starts_with_the_first_scan_that_a_host_receives(bench: Start) 
     started = bench(scene=script, rate_hz=20.0)
     # Past the press, if the script's clock had started with power-up.
     wait_until(lambda: started.ask("status")["uptime_s"] > 0.6)
-    host = started.host()
-    host.start()
+    host = started.host().start()
     host.wait_for(lambda: len(host.scans()) >= 90 and host.kind(Hello))
     scans = [scan for scan in host.scans() if scan.channel == Channel.MAGNITUDE]
     seen = [volts(host, scan) > 0.15 for scan in scans]
@@ -279,8 +269,7 @@ def test_scene_and_noise_are_changed_while_it_runs(bench: Start) -> None:
     press = {"id": "p", "at_s": 0, "duration_s": 3600, "x_mm": 1, "y_mm": 2}
     assert started.ask("play", scene={"press": [press]}) == {"length_s": 3600.0}
     assert [p["id"] for p in started.ask("scene")["presses"]] == ["p"]
-    host = started.host()
-    host.start()
+    host = started.host().start()
     host.wait_for(lambda: host.scans())
     assert np.ptp(host.scans()[0].samples) == 0
     started.ask("noise", noise_v=0.01)
@@ -304,8 +293,7 @@ def test_the_skin_drifts_as_it_is_told_live_and_by_a_scene(bench: Start, tmp_pat
     file.write_text(SMALL)
     sensor = load_description(file)
     started = bench(skin=SkinSimulator(sensor), sensor=str(file))
-    host = started.host()
-    host.start()
+    host = started.host().start()
     host.wait_for(lambda: host.scans())
     rest = host.scans()[0].samples
     started.ask("drift", step_k=5.0, uneven=0.0)
@@ -336,8 +324,7 @@ def test_nobody_gets_old_scans_and_nobody_blocks_the_twin(bench: Start) -> None:
 
 def test_a_host_that_does_not_read_loses_whole_frames(bench: Start) -> None:
     started = bench(rate_hz=500.0)
-    host = started.host()
-    host.start()
+    host = started.host().start()
     wait_until(lambda: started.ask("status")["ports"][0]["dropped"] > 50)
     host.wait_for(lambda: host.scans() and host.scans()[-1].counter > 60)
     assert host.decoders[0].counts.corrupt == 0
@@ -347,8 +334,7 @@ def test_a_host_that_does_not_read_loses_whole_frames(bench: Start) -> None:
 
 def test_garbage_costs_no_other_packet(bench: Start) -> None:
     started = bench(ports=2, rate_hz=30.0)  # seconds of it wait on the line for a busy host
-    host = started.host()
-    host.start()
+    host = started.host().start()
     host.wait_for(lambda: host.scans(0) and host.scans(1))
     started.ask("garbage", port=0, count=4000)
     host.wait_for(lambda: host.decoders[0].counts.corrupt > 0)
@@ -361,8 +347,7 @@ def test_garbage_costs_no_other_packet(bench: Start) -> None:
 @pytest.mark.slow
 def test_a_muted_channel_is_silent_and_comes_back(bench: Start) -> None:
     started = bench(ports=2)
-    host = started.host()
-    host.start()
+    host = started.host().start()
     host.wait_for(lambda: host.scans(0) and host.scans(1))
     started.ask("mute", channel="structure", seconds=2.0)
     host.wait_for(lambda: np.max(np.diff([s.counter for s in host.scans(1)]), initial=0) >= 25)
@@ -373,8 +358,7 @@ def test_unplug_and_replug_by_a_stable_link(bench: Start, tmp_path: Path) -> Non
     started = bench(ports=2, link_folder=tmp_path / "dev")
     paths = [str(tmp_path / "dev" / name) for name in ("magnitude", "structure")]
     assert list(started.twin.ports) == paths
-    host = started.host()
-    host.start()
+    host = started.host().start()
     host.wait_for(lambda: host.scans(0) and host.scans(1))
     started.ask("unplug", port=1)
     assert not os.path.lexists(paths[1])
@@ -439,8 +423,7 @@ class BreakingSkin:
 
 def test_a_skin_that_fails_stops_the_twin_with_its_error(bench: Start) -> None:
     started = bench(BreakingSkin())
-    host = started.host()
-    host.start()
+    host = started.host().start()
     host.wait_for(lambda: host.scans())
     started.ask("press", x_mm=0, y_mm=0)
     with pytest.raises(ArithmeticError, match="singular"):

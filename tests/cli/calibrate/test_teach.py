@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixture_types import Run
 from handmade_skin import presses, write_description
 from tactomo_models.archive import read_arrays
 from tactomo_models.calibration.taught_skin import read_taught, taught_path
 
-Run = Callable[..., Any]
 Arrays = dict[str, Any]
 
 
@@ -34,11 +34,11 @@ def errors_mm(tactomo: Run, folder: Path, *options: Any) -> tuple[np.ndarray, di
     """Of presses that nothing was taught by, on the same skin."""
     new = presses(20, seed=2)
     np.savez(folder / "new.npz", **new)
-    result = tactomo(
+    tactomo(
         *("reconstruct", folder / "new.npz", folder / "maps.npz", "--force"),
         *("-d", folder / "skin.toml", *options),
+        status=0,
     )
-    assert result.returncode == 0, result.stderr
     maps = read_arrays(folder / "maps.npz")
     places = np.stack([maps["contact_x_mm"], maps["contact_y_mm"]], axis=1)
     return np.linalg.norm(places - new["xy_mm"][maps["contact_frame"]], axis=1), maps
@@ -170,7 +170,6 @@ def test_bad_presses_are_named_and_not_kept(
     result = teach(tactomo, tmp_path, spoil(good))
     assert result.returncode == 1, result.stdout
     assert told in result.stderr
-    assert "Traceback" not in result.stderr
     assert not taught_path("palm").exists()
 
 
@@ -193,8 +192,8 @@ def test_another_skin_is_refused(tactomo: Run, tmp_path: Path, good: Arrays) -> 
     result = tactomo(
         *("reconstruct", tmp_path / "other.npz", tmp_path / "maps.npz"),
         *("-d", tmp_path / "skin.toml", "--taught", taught_path("palm")),
+        status=1,
     )
-    assert result.returncode == 1
     assert "does not fit this skin" in result.stderr
     assert "voltages at rest" in result.stderr
 
@@ -205,7 +204,5 @@ def test_a_damaged_file_is_told(tactomo: Run, tmp_path: Path) -> None:
     path = taught_path("palm")
     path.parent.mkdir(parents=True)
     path.write_bytes(b"PK")
-    result = tactomo("teach", "show", "--sensor", "palm")
-    assert result.returncode == 1
+    result = tactomo("teach", "show", "--sensor", "palm", status=1)
     assert "is damaged" in result.stderr
-    assert "Traceback" not in result.stderr

@@ -8,12 +8,12 @@ import resource
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from fixture_types import Run
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from mcap_ros2.decoder import DecoderFactory as Ros2DecoderFactory
@@ -30,8 +30,6 @@ from tactomo_models import Press, SkinSimulator, load_description
 from tactomo_protocol import Channel
 from terminal import Terminal
 from waiting import wait_until
-
-Run = Callable[..., Any]
 
 
 @pytest.fixture
@@ -56,8 +54,7 @@ def decoded(path: Path, topic: str) -> list[tuple[int, Any]]:
 
 
 def test_contacts_as_a_table(tactomo: Run, grasp: Path) -> None:
-    result = tactomo("export", grasp, "contacts.csv")
-    assert result.returncode == 0, result.stderr
+    result = tactomo("export", grasp, "contacts.csv", status=0)
     assert result.stdout == f"wrote contacts.csv: contacts, {FRAMES} frames\n"
     rows = rows_of(grasp.with_name("contacts.csv"))
     for number in range(FRAMES):
@@ -78,8 +75,7 @@ def test_contacts_as_a_table(tactomo: Run, grasp: Path) -> None:
 
 
 def test_a_file_for_foxglove(tactomo: Run, grasp: Path) -> None:
-    result = tactomo("export", grasp, "fox.mcap", "--layout", "left.json")
-    assert result.returncode == 0, result.stderr
+    tactomo("export", grasp, "fox.mcap", "--layout", "left.json", status=0)
     fox = grasp.with_name("fox.mcap")
     numbers = decoded(fox, f"/{SENSOR}/frame")
     assert [time for time, _ in numbers] == [START_NS + n * PERIOD_NS for n in range(FRAMES)]
@@ -94,7 +90,7 @@ def test_a_file_for_foxglove(tactomo: Run, grasp: Path) -> None:
 
 
 def test_some_seconds_of_it(tactomo: Run, grasp: Path) -> None:
-    assert tactomo("export", grasp, "some.csv", "--from", 1, "--to", 1.5).returncode == 0
+    tactomo("export", grasp, "some.csv", "--from", 1, "--to", 1.5, status=0)
     times = [float(row["time_s"]) for row in rows_of(grasp.with_name("some.csv"))]
     assert (min(times), max(times)) == (1.0, 1.45)
 
@@ -104,8 +100,7 @@ def test_a_recording_in_several_files(tactomo: Run, tmp_path: Path) -> None:
     folder.mkdir()
     for number, part in enumerate((range(30), range(30, 60), range(60, FRAMES))):
         write_grasp(folder / f"{SENSOR}-00000{number}-20231114T221320Z.mcap", part)
-    result = tactomo("export", folder, tmp_path / "all.csv")
-    assert result.returncode == 0, result.stderr
+    tactomo("export", folder, tmp_path / "all.csv", status=0)
     times = sorted({float(row["time_s"]) for row in rows_of(tmp_path / "all.csv")})
     np.testing.assert_allclose(times, np.arange(FRAMES) * PERIOD_NS * 1e-9)
 
@@ -116,7 +111,7 @@ def test_a_wall_clock_that_is_set_does_not_fold_the_times(tactomo: Run, tmp_path
         return {"acquired_realtime_ns": START_NS + number * PERIOD_NS - hour}
 
     write_grasp(tmp_path / "set.mcap", change=set_back)
-    assert tactomo("export", "set.mcap", "set.csv").returncode == 0
+    tactomo("export", "set.mcap", "set.csv", status=0)
     times = sorted({float(row["time_s"]) for row in rows_of(tmp_path / "set.csv")})
     np.testing.assert_allclose(times, np.arange(FRAMES) * PERIOD_NS * 1e-9)
 
@@ -130,7 +125,7 @@ def test_a_daemon_that_was_restarted_begins_anew(tactomo: Run, tmp_path: Path) -
         return {"session": "again", "acquired_monotonic_ns": (number - 45) * PERIOD_NS}
 
     write_grasp(tmp_path / "two.mcap", change=restart)
-    assert tactomo("export", "two.mcap", "two.csv").returncode == 0
+    tactomo("export", "two.mcap", "two.csv", status=0)
     times = sorted({float(row["time_s"]) for row in rows_of(tmp_path / "two.csv")})
     np.testing.assert_allclose(times, np.arange(FRAMES) * PERIOD_NS * 1e-9)
     result = tactomo("plot", "two.mcap", "-o", "two.svg", "--what", "path")
@@ -140,8 +135,7 @@ def test_a_daemon_that_was_restarted_begins_anew(tactomo: Run, tmp_path: Path) -
 def test_a_cut_recording_gives_what_is_there_and_says_so(tactomo: Run, grasp: Path) -> None:
     data = grasp.read_bytes()
     grasp.write_bytes(data[: len(data) * 2 // 3])
-    result = tactomo("export", grasp, "contacts.csv")
-    assert result.returncode == 0
+    result = tactomo("export", grasp, "contacts.csv", status=0)
     assert "is cut off or damaged" in result.stderr
     frames = len({row["time_s"] for row in rows_of(grasp.with_name("contacts.csv"))})
     assert FRAMES / 2 < frames < FRAMES
@@ -151,8 +145,7 @@ def test_a_recording_cut_before_its_first_frame_has_nothing_to_export(
     tactomo: Run, grasp: Path
 ) -> None:
     grasp.write_bytes(grasp.read_bytes()[:600])
-    result = tactomo("export", grasp, "contacts.csv")
-    assert result.returncode == 1
+    result = tactomo("export", grasp, "contacts.csv", status=1)
     assert "no dual scan of paper_square is in it" in result.stderr
 
 
@@ -201,12 +194,11 @@ def test_what_is_there_is_written_over_only_if_one_says_so(tactomo: Run, grasp: 
     into_csv = ("export", grasp, "contacts.csv")
     with_layout = ("export", grasp, "fox.mcap", "--layout", "layout.json")
     for arguments, name in ((into_csv, "contacts.csv"), (with_layout, "layout.json")):
-        result = tactomo(*arguments)
-        assert result.returncode == 1
+        result = tactomo(*arguments, status=1)
         assert f"{name} exists already" in result.stderr
         assert "--force" in result.stderr
         assert grasp.with_name(name).read_text() == "precious"
-        assert tactomo(*arguments, "--force").returncode == 0
+        tactomo(*arguments, "--force", status=0)
         assert grasp.with_name(name).read_text() != "precious"
 
 
@@ -237,15 +229,14 @@ def bare_recording(tactomo: Run, tmp_path: Path, scans_pressed: int) -> Path:
     arrays: dict[str, Any] = {**scans, **references}
     np.savez(tmp_path / "in.npz", **arrays)
     arguments = ("import", "in.npz", "bare.mcap", "--description", "small.toml", "--rate", 20)
-    assert tactomo(*arguments, "--reference-frames", "0:20").returncode == 0
+    tactomo(*arguments, "--reference-frames", "0:20", status=0)
     return tmp_path / "bare.mcap"
 
 
 @pytest.mark.slow
 def test_what_holds_no_frames_is_reconstructed_first(tactomo: Run, tmp_path: Path) -> None:
     bare_recording(tactomo, tmp_path, scans_pressed=10)
-    result = tactomo("export", "bare.mcap", "made.csv", "--from", 1)
-    assert result.returncode == 0, result.stderr
+    tactomo("export", "bare.mcap", "made.csv", "--from", 1, status=0)
     rows = rows_of(tmp_path / "made.csv")
     assert {float(row["time_s"]) >= 1.0 for row in rows} == {True}
     assert {row["age_s"] for row in rows} == {""}  # nobody knows it
@@ -253,7 +244,7 @@ def test_what_holds_no_frames_is_reconstructed_first(tactomo: Run, tmp_path: Pat
     times = [float(row["time_s"]) for row in touched]
     assert (min(times), max(times)) == pytest.approx((1.25, 1.7), abs=0.02)
     assert float(touched[5]["x_mm"]) == pytest.approx(10.0, abs=2.0)
-    assert tactomo("export", "bare.mcap", "made", "--ros2", "--from", 1).returncode == 0
+    tactomo("export", "bare.mcap", "made", "--ros2", "--from", 1, status=0)
     with (tmp_path / "made/made.mcap").open("rb") as file:
         reader = make_reader(file, decoder_factories=[Ros2DecoderFactory()])
         told = list(reader.iter_decoded_messages(topics=["/diagnostics"]))
@@ -264,8 +255,7 @@ def test_what_holds_no_frames_is_reconstructed_first(tactomo: Run, tmp_path: Pat
         assert "age_s" not in keys  # nobody knows it here, either
         stamp = each.decoded_message.header.stamp
         assert each.message.log_time == stamp.sec * 1_000_000_000 + stamp.nanosec
-    result = tactomo("plot", "bare.mcap", "-o", "made.png", "--what", "path")
-    assert result.returncode == 0, result.stderr
+    tactomo("plot", "bare.mcap", "-o", "made.png", "--what", "path", status=0)
     assert not list(tmp_path.glob(".tactomo*"))
 
 

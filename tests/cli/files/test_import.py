@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from fixture_types import Run
 from numpy.typing import NDArray
 from tactomo.recordings.recording import Recording, open_recording
 from tactomo_models import load_description
 from tactomo_models.arrays import FloatArray
 from tactomo_protocol import Channel, CompanionReading, Decoder, Scan
-
-Run = Callable[..., Any]
 
 ELECTRODES = 16
 
@@ -52,9 +50,17 @@ def test_single_ended_volts_become_differences_in_order(tactomo: Run, tmp_path: 
     complex_volts = volts * (1 + 0.1j)
     np.savez(tmp_path / "in.npz", t=times, injection=INJECTION, volts=complex_volts)
     result = tactomo(
-        *("import", "in.npz", "out.mcap", "--description", "tank_disc", "--reference-frames", "0:2")
+        *(
+            "import",
+            "in.npz",
+            "out.mcap",
+            "--description",
+            "tank_disc",
+            "--reference-frames",
+            "0:2",
+        ),
+        status=0,
     )
-    assert result.returncode == 0, result.stderr
     assert "10% is quadrature" in result.stdout
     recording = open_recording(tmp_path / "out.mcap")
     read = scans(recording)
@@ -77,8 +83,7 @@ def test_a_reversed_and_shuffled_injection_is_put_right(tactomo: Run, tmp_path: 
     injection, turned = INJECTION[shuffled], volts[:, shuffled]
     injection[::2], turned[:, ::2] = injection[::2, ::-1].copy(), -turned[:, ::2]
     np.savez(tmp_path / "in.npz", injection=injection, volts=turned)
-    result = tactomo("import", "in.npz", "out.mcap", "--description", "tank_disc", "--rate", "10")
-    assert result.returncode == 0, result.stderr
+    tactomo("import", "in.npz", "out.mcap", "--description", "tank_disc", "--rate", "10", status=0)
     read = scans(open_recording(tmp_path / "out.mcap"))
     got = np.array([scan.samples for _, scan in read])
     assert np.allclose(got, expected(volts), rtol=1e-6, atol=1e-6)
@@ -89,8 +94,7 @@ def test_a_converters_counts_are_taken_as_they_are(tactomo: Run, tmp_path: Path)
     """Also unsigned ones, whose differences may be below zero."""
     counts = np.random.default_rng(2).integers(0, 1 << 16, (2, ELECTRODES, ELECTRODES), np.uint16)
     np.savez(tmp_path / "in.npz", injection=INJECTION, volts=counts)
-    result = tactomo("import", "in.npz", "out.mcap", "--description", "tank_disc", "--rate", "10")
-    assert result.returncode == 0, result.stderr
+    tactomo("import", "in.npz", "out.mcap", "--description", "tank_disc", "--rate", "10", status=0)
     got = np.array([scan.samples for _, scan in scans(open_recording(tmp_path / "out.mcap"))])
     assert np.array_equal(got, expected(counts.astype(float)))
 
@@ -104,8 +108,7 @@ def test_the_batch_layout_keeps_channels_reference_and_gaps(tactomo: Run, tmp_pa
     }
     arrays["structure"][2] = np.nan  # that scan did not arrive
     np.savez(tmp_path / "in.npz", **arrays)
-    result = tactomo("import", "in.npz", "out.mcap", "--rate", "20", "--sensor", "left_forearm")
-    assert result.returncode == 0, result.stderr
+    tactomo("import", "in.npz", "out.mcap", "--rate", "20", "--sensor", "left_forearm", status=0)
     recording = open_recording(tmp_path / "out.mcap")
     read = [scan for _, scan in scans(recording)]
     assert [(s.counter, s.channel.name[0]) for s in read] == [
@@ -119,7 +122,7 @@ def test_the_batch_layout_keeps_channels_reference_and_gaps(tactomo: Run, tmp_pa
 
 
 def test_readings_of_companions_are_kept(tactomo: Run, tmp_path: Path) -> None:
-    assert tactomo("models", "copy", "graded_square", "cell.toml").returncode == 0
+    tactomo("models", "copy", "graded_square", "cell.toml", status=0)
     cells = "[companion.cell]\nindex = 7\ngain_n_per_unit = 2.0\nnoise_n = 0.1\n"
     with (tmp_path / "cell.toml").open("a") as file:
         file.write(cells)
@@ -128,8 +131,7 @@ def test_readings_of_companions_are_kept(tactomo: Run, tmp_path: Path) -> None:
     arrays = {"magnitude": volts, "magnitude_reference": volts[0], "companion_cell": readings}
     np.savez(tmp_path / "in.npz", **arrays, companion_cell_reference=0.5)
     options = ("-d", "cell.toml", "--rate", "20")
-    result = tactomo("import", "in.npz", "out.mcap", *options)
-    assert result.returncode == 0, result.stderr
+    tactomo("import", "in.npz", "out.mcap", *options, status=0)
     recording, decoder = open_recording(tmp_path / "out.mcap"), Decoder()
     packets = [p for _, data in recording.chunks(0) for p in decoder.feed(data)]
     kept = [p for p in packets if isinstance(p, CompanionReading)]
@@ -139,8 +141,7 @@ def test_readings_of_companions_are_kept(tactomo: Run, tmp_path: Path) -> None:
     reference = recording.first_reference()
     assert reference is not None
     assert tuple(reference.companions or ()) == (("cell", 0.5),)
-    result = tactomo("import", "in.npz", "again.mcap", *options, "--reference-frames", "0:2")
-    assert result.returncode == 0, result.stderr
+    tactomo("import", "in.npz", "again.mcap", *options, "--reference-frames", "0:2", status=0)
     reference = open_recording(tmp_path / "again.mcap").first_reference()
     assert reference is not None
     assert tuple(reference.companions or ()) == (("cell", 1.5),)
@@ -204,8 +205,7 @@ def test_what_cannot_be_imported_is_refused(
     tactomo: Run, tmp_path: Path, arrays: dict[str, Any], options: list[str], says: str
 ) -> None:
     np.savez(tmp_path / "in.npz", **arrays)
-    result = tactomo("import", "in.npz", "out.mcap", *options)
-    assert result.returncode == 1
+    result = tactomo("import", "in.npz", "out.mcap", *options, status=1)
     assert says in result.stderr
     assert not (tmp_path / "out.mcap").exists()
 
@@ -246,8 +246,7 @@ def test_sciospecs_files_are_read_in_the_order_of_their_dates(
     volts = potentials(4)
     paths = save_eit(tmp_path / "scan", volts)
     given = [tmp_path / "scan"] if how == "folder" else paths
-    result = tactomo("import", *given, "out.mcap", "--description", "tank_disc")
-    assert result.returncode == 0, result.stderr
+    tactomo("import", *given, "out.mcap", "--description", "tank_disc", status=0)
     read = scans(open_recording(tmp_path / "out.mcap"))
     assert [time_s for time_s, _ in read] == pytest.approx([0, 0.05, 0.1, 0.15], abs=1e-6)
     got = np.array([scan.samples for _, scan in read])
@@ -259,8 +258,7 @@ def test_channels_that_were_not_measured_are_left_out(tactomo: Run, tmp_path: Pa
     volts = potentials(1)
     text = eit_text(volts[0] * (1 + 0j), "2024.01.31. 12:30:05.000", 17)
     (tmp_path / "a.eit").write_text(text)
-    result = tactomo("import", "a.eit", "out.mcap", "-d", "tank_disc", "--rate", "1")
-    assert result.returncode == 0, result.stderr
+    tactomo("import", "a.eit", "out.mcap", "-d", "tank_disc", "--rate", "1", status=0)
     [(_, scan)] = scans(open_recording(tmp_path / "out.mcap"))
     assert np.allclose(scan.samples, expected(volts)[0], rtol=1e-6, atol=1e-6)
     (tmp_path / "b.eit").write_text(text.replace("\n17 18\n", "\n3 18\n"))
@@ -291,8 +289,7 @@ def test_a_line_that_is_wrong_is_named(
     lines = path.read_text().splitlines()
     lines[line - 1 :] = [] if text is None else [text, *lines[line:]]
     path.write_text("\n".join(lines))
-    result = tactomo("import", path, "out.mcap", "--description", "tank_disc")
-    assert result.returncode == 1
+    result = tactomo("import", path, "out.mcap", "--description", "tank_disc", status=1)
     assert f"{path}, {says}" in result.stderr
     assert not (tmp_path / "out.mcap").exists()
 
@@ -310,7 +307,6 @@ def test_sciospecs_files_must_belong_together(tactomo: Run, tmp_path: Path) -> N
 def test_an_existing_recording_is_not_overwritten(tactomo: Run, tmp_path: Path) -> None:
     np.savez(tmp_path / "in.npz", magnitude=np.ones((4, 208)))
     (tmp_path / "out.mcap").write_text("precious")
-    result = tactomo("import", "in.npz", "out.mcap", "--rate", "1")
-    assert result.returncode == 1
+    result = tactomo("import", "in.npz", "out.mcap", "--rate", "1", status=1)
     assert "exists already" in result.stderr
     assert (tmp_path / "out.mcap").read_text() == "precious"

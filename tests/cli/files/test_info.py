@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from fixture_types import Run
 from hostile_files import BAD_DEVICE, BAD_SENSOR, markup_recording
 from scipy.io import savemat
-
-Run = Callable[..., Any]
 
 
 def test_info_of_a_shipped_description(tactomo: Run) -> None:
@@ -43,8 +40,7 @@ def test_info_of_what_cannot_be_read(
 ) -> None:
     if content is not None:
         (tmp_path / name).write_text(content)
-    result = tactomo("info", name)
-    assert result.returncode == 1
+    result = tactomo("info", name, status=1)
     assert says in result.stderr
 
 
@@ -63,8 +59,7 @@ def test_info_of_every_file_that_reconstruct_reads(tactomo: Run, tmp_path: Path)
 
 def test_names_of_others_are_shown_as_they_are(tactomo: Run, tmp_path: Path) -> None:
     markup_recording(tmp_path / "a.mcap")
-    result = tactomo("info", "a.mcap")
-    assert result.returncode == 0, result.stderr
+    result = tactomo("info", "a.mcap", status=0)
     for name in (BAD_DEVICE, BAD_SENSOR, "skin[left]"):
         assert name in result.stdout
     assert "\x1b]" not in result.stdout
@@ -72,7 +67,6 @@ def test_names_of_others_are_shown_as_they_are(tactomo: Run, tmp_path: Path) -> 
 
 def test_models_are_not_built_over_a_file(tactomo: Run, tmp_path: Path) -> None:
     (tmp_path / "thesis.npz").write_text("precious")
-    result = tactomo("models", "build", "-o", "thesis.npz")
-    assert result.returncode == 1
+    result = tactomo("models", "build", "-o", "thesis.npz", status=1)
     assert "thesis.npz exists already" in result.stderr
     assert (tmp_path / "thesis.npz").read_text() == "precious"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from fixture_types import Run
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
@@ -23,7 +23,6 @@ from tactomo_models.archive import read_arrays
 from tactomo_models.arrays import FloatArray
 from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
 
-Run = Callable[..., Any]
 WHERE = Press(0.05, 0.02, 150.0, 0.02)
 FRAMES = 4
 ROWS = np.arange(416.0).reshape(2, 208) + 1
@@ -48,8 +47,8 @@ def located(tactomo: Run, folder: Path, *arguments: Any) -> str:
     result = tactomo(
         *("reconstruct", arguments[0], folder / "maps.npz", "-d", "tank_disc", "--force"),
         *("--method", "tikhonov", *arguments[1:]),
+        status=0,
     )
-    assert result.returncode == 0, result.stderr
     maps = read_arrays(folder / "maps.npz")
     assert not maps["flags"].any()
     last = maps["contact_frame"] == maps["contact_frame"].max()
@@ -192,8 +191,9 @@ def test_another_pattern_is_proposed_and_then_read(
     (tmp_path / "there.csv").write_text(text(there))
     files = tmp_path / "there.csv", "--reference", tmp_path / "rest.csv"
     if rest.shape[1] != 208:  # as many as the description's are taken as its
-        refused = tactomo("reconstruct", files[0], tmp_path / "maps.npz", "-d", "tank_disc")
-        assert refused.returncode == 1
+        refused = tactomo(
+            "reconstruct", files[0], tmp_path / "maps.npz", "-d", "tank_disc", status=1
+        )
         assert f"{rest.shape[1]} numbers a frame, which fit {pattern}" in refused.stderr
         assert f"--pattern {pattern}" in refused.stderr
     located(tactomo, tmp_path, *files, "--pattern", pattern)
@@ -231,8 +231,9 @@ def test_volts_out_of_phase_are_turned_as_the_reference_is(
     assert "turned by" in said
     angles = np.random.default_rng(0).uniform(0, 2 * np.pi, 208)
     savemat(tmp_path / "in.mat", {"vi": there * np.exp(1j * angles)})
-    result = tactomo("import", tmp_path / "in.mat", "out.mcap", "-d", "tank_disc", "--rate", "1")
-    assert result.returncode == 1
+    result = tactomo(
+        "import", tmp_path / "in.mat", "out.mcap", "-d", "tank_disc", "--rate", "1", status=1
+    )
     assert "out of phase with the current" in result.stderr
 
 
@@ -252,10 +253,10 @@ def test_what_is_wrong_is_named(
     tactomo: Run, tmp_path: Path, name: str, content: bytes, told: str
 ) -> None:
     (tmp_path / name).write_bytes(content)
-    result = tactomo("reconstruct", tmp_path / name, tmp_path / "o.npz", "-d", "tank_disc")
-    assert result.returncode == 1
+    result = tactomo(
+        "reconstruct", tmp_path / name, tmp_path / "o.npz", "-d", "tank_disc", status=1
+    )
     assert told in result.stderr
-    assert "Traceback" not in result.stderr
 
 
 def test_what_cannot_be_told_apart_is_asked_for(tactomo: Run, tmp_path: Path) -> None:
@@ -290,8 +291,7 @@ def test_any_pattern_is_applied_or_refused_by_name(name: str) -> None:
 
 def test_doctor_examines_them_too(tactomo: Run, tmp_path: Path) -> None:
     (tmp_path / "rest.csv").write_text(text(np.vstack([tank()[0]] * 5)))
-    result = tactomo("doctor", tmp_path / "rest.csv")
-    assert result.returncode == 0, result.stdout
+    result = tactomo("doctor", tmp_path / "rest.csv", status=0)
     assert "healthy" in result.stdout
 
 

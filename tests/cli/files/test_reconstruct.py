@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from fixture_types import Run
 from tactomo.cli import app
 from tactomo_models import Flag, Press, SkinSimulator, available_methods, load_description
 from tactomo_models.calibration.calibration_file import (
@@ -21,8 +21,6 @@ from tactomo_models.growing_arrays import GrowingArrays
 from tactomo_protocol import Channel
 from typer.testing import CliRunner
 
-Run = Callable[..., Any]
-
 
 @pytest.mark.slow
 def test_a_press_is_found_in_a_file(tactomo: Run, tmp_path: Path) -> None:
@@ -32,8 +30,7 @@ def test_a_press_is_found_in_a_file(tactomo: Run, tmp_path: Path) -> None:
     scans = {name: np.stack([empty[name], pressed[name]]) for name in empty}
     references = {f"{name}_reference": volts for name, volts in empty.items()}
     np.savez(tmp_path / "in.npz", **scans, **references)  # type: ignore[arg-type]
-    result = tactomo("reconstruct", "in.npz", "out.npz")
-    assert result.returncode == 0
+    result = tactomo("reconstruct", "in.npz", "out.npz", status=0)
     assert "wrote out.npz: 2 frames\nno frame is flagged\n" in result.stdout
     assert re.search(r"1 +-30\.\d +\d\d\.\d .* 18\d ± \d kPa", result.stdout)
     with np.load(tmp_path / "out.npz") as maps:
@@ -65,8 +62,7 @@ def test_scans_that_repeat_earlier_ones_are_left_out_and_told(tactomo: Run, tmp_
         structure=np.vstack([live, np.repeat(live[-1:], 5, axis=0)]),
         structure_reference=rest,
     )
-    result = tactomo("reconstruct", "in.npz", "out.npz", "-d", "tank_disc")
-    assert result.returncode == 0
+    result = tactomo("reconstruct", "in.npz", "out.npz", "-d", "tank_disc", status=0)
     assert "left out: 5 scans that repeat earlier ones" in result.stderr
     assert "5 of 15 frames are flagged no_usable_scan" in result.stdout
     with np.load(tmp_path / "out.npz") as maps:
@@ -79,7 +75,7 @@ def test_scans_that_repeat_earlier_ones_are_left_out_and_told(tactomo: Run, tmp_
 def test_companions_of_a_file_are_judged_in_every_layout(
     tactomo: Run, tmp_path: Path, layout: str
 ) -> None:
-    assert tactomo("models", "copy", "graded_square", "cell.toml").returncode == 0
+    tactomo("models", "copy", "graded_square", "cell.toml", status=0)
     with (tmp_path / "cell.toml").open("a") as file:
         file.write("[companion.cell]\ngain_n_per_unit = 2.0\nnoise_n = 0.1\n")
     skin = SkinSimulator(load_description(tmp_path / "cell.toml"))
@@ -96,8 +92,7 @@ def test_companions_of_a_file_are_judged_in_every_layout(
         "companion_cell_reference": at_rest,
     }
     np.savez(tmp_path / "in.npz", **arrays)
-    result = tactomo("reconstruct", "in.npz", "out.npz", "-d", "cell.toml")
-    assert result.returncode == 0, result.stderr
+    tactomo("reconstruct", "in.npz", "out.npz", "-d", "cell.toml", status=0)
     with np.load(tmp_path / "out.npz") as maps:
         names = [Flag(int(flags)).names() for flags in maps["flags"]]
         assert names == [[], ["companion_missing"], ["companion_disputed"]]
@@ -121,11 +116,10 @@ def test_a_calibration_says_how_hard_is_pressed(tactomo: Run, tmp_path: Path) ->
     made = PressureCalibration.of_readings(subject, readings)
     save_calibration(made, tmp_path / "left.pressure.json")
     options = ("--calibration", "left.pressure.json")
-    assert tactomo("reconstruct", "in.npz", "out.npz", *options).returncode == 0
+    tactomo("reconstruct", "in.npz", "out.npz", *options, status=0)
     with np.load(tmp_path / "out.npz") as maps:  # 180 kPa change it by 0.177
         assert maps["contact_pressure_kpa"][0] == pytest.approx(50 + 0.177 / 2e-3, abs=5)
-    refused = tactomo("reconstruct", "in.npz", "out.npz", *options, "-d", "skin_round")
-    assert refused.returncode == 1
+    refused = tactomo("reconstruct", "in.npz", "out.npz", *options, "-d", "skin_round", status=1)
     assert "is of a sensor as paper_square describes it" in refused.stderr
 
 
@@ -156,8 +150,7 @@ def test_every_method_can_be_asked_for(tmp_path: Path) -> None:
 
 def test_an_unknown_method_is_refused(tactomo: Run, tmp_path: Path) -> None:
     np.savez(tmp_path / "in.npz", magnitude=np.ones((1, 208)), magnitude_reference=np.ones(208))
-    result = tactomo("reconstruct", "in.npz", "out.npz", "--method", "guess")
-    assert result.returncode == 2
+    result = tactomo("reconstruct", "in.npz", "out.npz", "--method", "guess", status=2)
     assert all(method in result.stderr for method in available_methods())
 
 
@@ -183,7 +176,7 @@ def test_bad_scans_are_flagged_in_the_file(tactomo: Run, tmp_path: Path) -> None
     structure[5] = 0.3 * rng.standard_normal(208)
     empty = {f"{name}_reference": noisy(volts) for name, volts in skin.voltages([]).items()}
     np.savez(tmp_path / "in.npz", **pressed, **empty)
-    assert tactomo("reconstruct", "in.npz", "out.npz").returncode == 0
+    tactomo("reconstruct", "in.npz", "out.npz", status=0)
     with np.load(tmp_path / "out.npz") as maps:
         flags = [Flag(int(value)) for value in maps["flags"]]
     assert flags[0] == Flag(0)
@@ -206,8 +199,7 @@ def test_flags_are_told_in_words(tactomo: Run, tmp_path: Path) -> None:
     with np.load(tmp_path / "in.npz") as arrays:
         one = {name: array for name, array in arrays.items() if "structure" not in name}
     np.savez(tmp_path / "one.npz", **one)
-    result = tactomo("reconstruct", "one.npz", "out.npz", "--method", "tikhonov")
-    assert result.returncode == 0
+    result = tactomo("reconstruct", "one.npz", "out.npz", "--method", "tikhonov", status=0)
     flagged = "2 of 2 frames are flagged structure_missing: no scans of the structure channel\n"
     assert flagged in result.stdout
     assert "no contact is found" in result.stdout
@@ -219,8 +211,7 @@ def test_methods_are_drawn_side_by_side(
 ) -> None:
     scans_file(tmp_path / "in.npz")
     named = [word for name in methods for word in ("--method", name)]
-    result = tactomo("reconstruct", "in.npz", "out.npz", *named, "--picture", "maps.svg")
-    assert result.returncode == 0, result.stderr
+    result = tactomo("reconstruct", "in.npz", "out.npz", *named, "--picture", "maps.svg", status=0)
     assert "wrote maps.svg" in result.stdout
     drawn = (tmp_path / "maps.svg").read_text("utf-8")
     assert all(f"{name}, frame 1" in drawn for name in ("tikhonov", "noser"))
@@ -230,14 +221,13 @@ def test_only_its_own_output_is_written_over_unasked(tactomo: Run, tmp_path: Pat
     scans_file(tmp_path / "in.npz")
     scans = (tmp_path / "in.npz").read_bytes()
     command = ("reconstruct", "in.npz", "out.npz", "--method", "tikhonov")
-    assert tactomo(*command).returncode == 0
-    assert tactomo(*command).returncode == 0  # it can be computed again
-    swapped = tactomo("reconstruct", "out.npz", "in.npz")
-    assert swapped.returncode == 1
+    tactomo(*command, status=0)
+    tactomo(*command, status=0)  # it can be computed again
+    swapped = tactomo("reconstruct", "out.npz", "in.npz", status=1)
     assert "in.npz exists already" in swapped.stderr
-    assert tactomo("reconstruct", "in.npz", "in.npz", "--force").returncode == 2
+    tactomo("reconstruct", "in.npz", "in.npz", "--force", status=2)
     assert (tmp_path / "in.npz").read_bytes() == scans
-    assert tactomo("reconstruct", "in.npz", "new/out.npz").returncode == 1
+    tactomo("reconstruct", "in.npz", "new/out.npz", status=1)
     assert not (tmp_path / "new").exists()
 
 
@@ -245,7 +235,7 @@ def test_what_is_no_file_is_not_replaced_by_one(tactomo: Run, tmp_path: Path) ->
     scans_file(tmp_path / "in.npz")
     (tmp_path / "nothing").symlink_to("/dev/null")
     command = ("reconstruct", "in.npz", "nothing", "--method", "tikhonov")
-    assert tactomo(*command).returncode == 0
+    tactomo(*command, status=0)
     assert Path("/dev/null").is_char_device()
     assert (tmp_path / "nothing").is_symlink()
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import matplotlib.image as mpl_image
 import numpy as np
 import pytest
+from fixture_types import Run
 from recorded_grasp import (
     FIRST_PRESSED,
     FRAMES,
@@ -22,8 +22,6 @@ from recorded_grasp import (
 from tactomo.cli.files.recorded_frames import recorded_frames
 from tactomo.cli.plot.course import read_course, read_maps, telling_moments
 from tactomo.cli.plot.page import draw_page
-
-Run = Callable[..., Any]
 
 
 @pytest.fixture
@@ -42,8 +40,7 @@ def axes_labels(figure: Any) -> list[str]:
 def test_a_page_of_each_kind(
     tactomo: Run, grasp: Path, name: str, options: tuple[str, ...]
 ) -> None:
-    result = tactomo("plot", grasp, "-o", name, *options)
-    assert result.returncode == 0, result.stderr
+    result = tactomo("plot", grasp, "-o", name, *options, status=0)
     assert result.stdout == f"wrote {name}: 2 contacts in 78 frames, 4.0 s\n"
     data = grasp.with_name(name).read_bytes()
     assert data.startswith({"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF"}[name[-3:]])
@@ -101,15 +98,14 @@ def test_some_panels_of_some_seconds(tactomo: Run, grasp: Path) -> None:
     result = tactomo(
         *("plot", grasp, "-o", "some.png", "--what", "path, pressure"),
         *("--from", 1, "--to", 2),
+        status=0,
     )
-    assert result.returncode == 0, result.stderr
     assert "1 contact in 20 frames" in result.stdout
 
 
 def test_nothing_pressed_is_a_page_too(tactomo: Run, tmp_path: Path) -> None:
     path = write_grasp(tmp_path / "idle.mcap", range(10, 18))
-    result = tactomo("plot", path, "-o", "idle.png")
-    assert result.returncode == 0, result.stderr
+    result = tactomo("plot", path, "-o", "idle.png", status=0)
     assert "0 contacts in 8 frames" in result.stdout
 
 
@@ -138,11 +134,10 @@ def test_a_picture_that_is_there_is_drawn_over_only_if_one_says_so(
 ) -> None:
     page = grasp.with_name("page.png")
     page.write_text("precious")
-    result = tactomo("plot", grasp, "-o", page)
-    assert result.returncode == 1
+    result = tactomo("plot", grasp, "-o", page, status=1)
     assert "--force" in result.stderr
     assert page.read_text() == "precious"
-    assert tactomo("plot", grasp, "-o", page, "--force").returncode == 0
+    tactomo("plot", grasp, "-o", page, "--force", status=0)
     assert page.read_bytes().startswith(b"\x89PNG")
 
 

@@ -9,16 +9,14 @@ import threading
 import tty
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from fake_machine import FakeMachine
+from fixture_types import Run
 from tactomo.acquisition.identify import identify
 from tactomo.cli.run.ports import lines, question, survey
 from tactomo_protocol import Channel, Command, Decoder, Hello, SampleFormat, encode
 from waiting import wait_until
-
-Run = Callable[..., Any]
 
 HELLO = Hello(
     device_id="skin-7f3a",
@@ -88,8 +86,7 @@ def test_adapters_are_shown_with_their_names_holders_and_troubles(tmp_path: Path
 
 
 def test_nothing_there_says_what_to_do(tactomo: Run) -> None:
-    result = tactomo("ports")
-    assert result.returncode == 0
+    result = tactomo("ports", status=0)
     if "ttyUSB" not in result.stdout and "ttyACM" not in result.stdout:
         assert "no USB adapter is there" in result.stdout
         assert "tactomo twin" in result.stdout

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import pytest
+from fixture_types import Run
 from processes import children_of, is_running
 from tactomo.cli import app
 from tactomo.cli.children import ChildError, Family
@@ -19,8 +20,6 @@ from tactomo.twin import TwinConfig
 from tactomo_models import load_description
 from typer.main import get_command
 from waiting import PATIENCE_S, wait_until
-
-Run = Callable[..., Any]
 
 linux = pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks processes up in /proc")
 
@@ -61,8 +60,7 @@ def announced(stream: IO[str] | None) -> dict[str, Any]:
 
 
 def test_a_twin_whose_control_address_is_taken_says_what_to_do(tactomo: Run, control: Any) -> None:
-    result = tactomo("twin", "--link", "dev", "--twin-control", control.address)
-    assert result.returncode == 1
+    result = tactomo("twin", "--link", "dev", "--twin-control", control.address, status=1)
     assert "is in use; stop the twin or demo that runs already" in result.stderr
 
 
@@ -72,8 +70,7 @@ def test_a_link_is_one_twins_as_long_as_it_lives(start: Run, tactomo: Run, tmp_p
     first = start(*command, "--announce")
     announced(first.stdout)
     device = os.readlink(tmp_path / "dev" / "skin")
-    second = tactomo(*command)
-    assert second.returncode == 1
+    second = tactomo(*command, status=1)
     said = f"the link dev/skin is that of another twin that runs (pid {first.pid}); stop that one"
     assert said in second.stderr
     assert "--link another folder" in second.stderr
@@ -113,21 +110,19 @@ def twin_command() -> Any:
 def test_what_a_user_can_cause_is_told_without_a_traceback(
     tactomo: Run, arguments: list[str], says: str
 ) -> None:
-    result = tactomo(*arguments)
-    assert result.returncode == 1
+    result = tactomo(*arguments, status=1)
     assert result.stderr.startswith("tactomo: ")
     assert says in result.stderr
 
 
 def test_a_speed_that_is_none_is_a_usage_error(tactomo: Run, tmp_path: Path) -> None:
     for speed in ("fast", "-1", "nan"):
-        assert tactomo("replay", "none.mcap", "--speed", speed).returncode == 2
+        tactomo("replay", "none.mcap", "--speed", speed, status=2)
 
 
 @pytest.mark.slow
 def test_a_child_that_fails_takes_the_demo_down_and_its_words_are_shown(tactomo: Run) -> None:
-    result = tactomo("demo", "--description", "nosuch", "--viewer-port", "0")
-    assert result.returncode == 1
+    result = tactomo("demo", "--description", "nosuch", "--viewer-port", "0", status=1)
     assert "stopped (exit status 1)" in result.stderr
     assert "cannot read the sensor description nosuch" in result.stderr
 

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
+from fixture_types import Run
 from tactomo.config import load_config
 from tactomo_client import Keys
 from tactomo_client.keys import read_public, read_secret
-
-Run = Callable[..., Any]
 
 
 @pytest.fixture
@@ -122,7 +119,6 @@ def test_what_cannot_be_done_says_why(
     assert not (tmp_path / "keys" / "left.clients").exists()
     assert outcome.returncode == 1
     assert said in outcome.stderr
-    assert "Traceback" not in outcome.stderr
 
 
 def test_a_clients_folder_must_be_unambiguous(keys: Run, tactomo: Run, tmp_path: Path) -> None:
@@ -130,8 +126,7 @@ def test_a_clients_folder_must_be_unambiguous(keys: Run, tactomo: Run, tmp_path:
         tactomo("keys", "make", name, "--keys", tmp_path / name)
     folder = tmp_path / "desk"
     there = "--address", "tcp://127.0.0.1:9", "--keys", folder
-    nobody = tactomo("status", *there)
-    assert nobody.returncode == 1
+    nobody = tactomo("status", *there, status=1)
     assert "should hold one server's public key, and holds none" in nobody.stderr
     for name in ("arm", "leg"):
         (folder / f"{name}.key").write_bytes((tmp_path / name / f"{name}.key").read_bytes())

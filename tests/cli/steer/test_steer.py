@@ -8,21 +8,19 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from threading import Timer
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from fake_control import FakeControl
+from fixture_types import Run
 from tactomo.running import Running, announced
 from tactomo.service.health_issues import FLAG_ADVICE, health_issues
 from tactomo_client import ControlError
 from tactomo_client.fake import FakeSensor
 from tactomo_models import Flag
 from waiting import PATIENCE_S, repeated, wait_until
-
-Run = Callable[..., Any]
 
 STATUS = {
     "sensor": "left_forearm",
@@ -79,8 +77,7 @@ def judge(control: Any) -> None:
 
 def test_status_shows_what_matters(tactomo: Run, control: Any) -> None:
     control.answers["status"] = STATUS
-    result = tactomo("status")
-    assert result.returncode == 0
+    result = tactomo("status", status=0)
     for words in (
         *(
             "left_forearm: running",
@@ -218,8 +215,7 @@ def test_status_as_json_and_of_a_daemon_that_has_no_data_yet(tactomo: Run, contr
     control.answers["status"] = STATUS
     assert json.loads(tactomo("status", "--json").stdout) == STATUS
     control.answers["status"] = NEW_DAEMON
-    result = tactomo("status")
-    assert result.returncode == 0
+    result = tactomo("status", status=0)
     assert "left_forearm: waiting for data" in result.stdout
     assert "unknown: no map yet" in result.stdout
 
@@ -261,29 +257,26 @@ def test_a_refusal_is_one_line_with_cause_and_next_step(tactomo: Run, control: A
     control.answers["tare"] = ControlError(
         "somebody presses", "let go and tare again", "tare_refused"
     )
-    result = tactomo("tare")
-    assert result.returncode == 1
+    result = tactomo("tare", status=1)
     assert result.stderr == "tactomo: somebody presses; let go and tare again\n"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", [["status"], ["poke", "clear"]])
 def test_nobody_there(tactomo: Run, command: list[str]) -> None:
-    result = tactomo(*command, "--address", "ipc:///nowhere/at/all")
-    assert result.returncode == 1
+    result = tactomo(*command, "--address", "ipc:///nowhere/at/all", status=1)
     assert re.search("(nothing|no daemon) answer.* at ipc:///nowhere/at/all", result.stderr)
 
 
 def test_a_wrong_address(tactomo: Run) -> None:
-    result = tactomo("status", "--address", "here")
-    assert result.returncode == 1
+    result = tactomo("status", "--address", "here", status=1)
     assert "tcp://127.0.0.1" in result.stderr
 
 
 def test_record_start_gives_a_name(tactomo: Run, control: Any) -> None:
     control.answers["record_start"] = {"path": "/x.mcap"}
-    assert tactomo("record", "start", "x.mcap").returncode == 0
-    assert tactomo("record", "start").returncode == 0
+    tactomo("record", "start", "x.mcap", status=0)
+    tactomo("record", "start", status=0)
     assert control.requests == [
         ("record_start", {"path": "x.mcap"}),
         ("record_start", {}),
@@ -310,8 +303,7 @@ def test_record_a_file_for_some_seconds(
     control.answers["record_start"] = {"path": "/x.mcap"}
     control.answers["record_stop"] = {"path": "/x.mcap", "bytes": 1_230_000}
     control.answers["status"] = STATUS
-    result = tactomo("record", "x.mcap", "--seconds", "0.6")
-    assert result.returncode == 0
+    result = tactomo("record", "x.mcap", "--seconds", "0.6", status=0)
     assert result.stdout.endswith("recorded /x.mcap (1.23 MB)\n")
     asked = [command for command, _ in control.requests]
     assert asked == ["record_start", *["status"] * 3, "record_stop"]
@@ -338,8 +330,7 @@ def test_a_recording_ends_with_the_command_and_its_terminal(
 def test_tier_and_budget(tactomo: Run, control: Any) -> None:
     control.answers["set_tier"] = {"tier": "tikhonov"}
     control.answers["set_budget"] = {"budget_ms": 20.0}
-    result = tactomo("method", "tikhonov", "--budget-ms", "20")
-    assert result.returncode == 0
+    tactomo("method", "tikhonov", "--budget-ms", "20", status=0)
     assert control.requests == [
         ("set_tier", {"tier": "tikhonov"}),
         ("set_budget", {"budget_ms": 20.0}),
@@ -364,7 +355,7 @@ def test_poke_sends_numbers_as_numbers(tactomo: Run, control: Any) -> None:
 def test_poke_tells_that_there_is_nothing_to_release(tactomo: Run, control: Any) -> None:
     command = ("poke", "release", "id=thumb", "--address", control.address)
     control.answers["release"] = {"released": True}
-    assert tactomo(*command).returncode == 0
+    tactomo(*command, status=0)
     control.answers["release"] = {"released": False}
     result = tactomo(*command)
     assert (result.returncode, result.stdout) == (1, "")

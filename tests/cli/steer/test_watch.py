@@ -7,12 +7,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import pytest
+from fixture_types import Run
 from tactomo.cli.steer.watch import frame_line, map_text
 from tactomo.running import Running, announced
 from tactomo_client import Contact, subscribe
@@ -20,8 +21,6 @@ from tactomo_client.appearance import PRESSED_COLOUR
 from tactomo_client.fake import FakeSensor
 from terminal import Terminal
 from waiting import PATIENCE_S, repeated
-
-Run = Callable[..., Any]
 
 CONTACT = Contact(
     7, x_mm=12.5, y_mm=-20.0, area_mm2=700.0, magnitude=0.1, magnitude_sigma=0.01, pressure_kpa=171
@@ -154,8 +153,7 @@ def test_in_a_pipe_it_says_that_nothing_comes(tactomo: Run) -> None:
 
 @pytest.mark.slow
 def test_a_name_that_nobody_publishes_is_told(tactomo: Run, sensor: FakeSensor) -> None:
-    result = tactomo("watch", "--sensor", "other", "--address", sensor.address)
-    assert result.returncode == 1
+    result = tactomo("watch", "--sensor", "other", "--address", sensor.address, status=1)
     assert f"no daemon answers at {sensor.address} for a sensor 'other'" in result.stderr
 
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 from daemon_bench import BOTH, REST, scan
+from fixture_types import Start
 from tactomo_protocol import Channel
-
-Start = Callable[..., Any]
 
 
 def two_skins(bench: Start) -> Any:

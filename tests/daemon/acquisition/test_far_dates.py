@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
+from fixture_types import Start
 from tactomo.recordings.recording import open_recording
 
-Start = Callable[..., Any]
 YEAR_NS = 31_556_952 * 10**9
 
 
@@ -32,8 +30,7 @@ def test_a_far_date_of_the_computer_ends_no_thread(
 
     if at_start:
         set_clock()
-    b = bench(recording={"file": path, "maps": True})
-    b.tare()
+    b = bench(recording={"file": path, "maps": True}).tare()
     if not at_start:
         set_clock()
     frames = [b.step() for _ in range(5)]

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from daemon_bench import HELLO, VOLTS_PER_COUNT, scan
+from fixture_types import Start
 from hostile_board import content_of, framed
 from tactomo_protocol import Acknowledge, AckStatus, Channel, SampleFormat, Scan, ScanFlag
 
-Start = Callable[..., Any]
 MAGNITUDE = Channel.MAGNITUDE
 
 
@@ -75,8 +74,7 @@ def test_scans_of_another_length_are_no_waiting_for_a_trigger(bench: Start) -> N
 
 
 def test_scans_in_swapped_order_are_told(bench: Start) -> None:
-    b = bench(ports=2)
-    b.tare()
+    b = bench(ports=2).tare()
     first = b.skin.counter
     for number in (2, 1, 4, 3):
         for channel in Channel:
@@ -103,8 +101,7 @@ def test_scans_unlike_the_hello_are_no_silence(
 
 
 def test_scans_of_a_channel_that_the_hello_does_not_name_are_not_mixed_in(bench: Start) -> None:
-    b = bench(ports=2)
-    b.tare()
+    b = bench(ports=2).tare()
     magnitude, structure = b.skin.lines
     before = b.ask("status")["scans"]["magnitude"]
     structure.say(scan(MAGNITUDE, b.skin.counter + 1))
@@ -135,8 +132,7 @@ def test_who_acknowledges_is_not_said_to_be_silent(bench: Start) -> None:
 
 @pytest.mark.slow
 def test_infinities_are_no_numbers_and_the_rest_is_used(bench: Start) -> None:
-    b = bench(real=True)
-    b.tare()
+    b = bench(real=True).tare()
     line = b.skin.lines[0]
     line.say(replace(line.hello, sample_format=SampleFormat.FLOAT32))
     counter = b.skin.counter + 1
@@ -151,8 +147,7 @@ def test_infinities_are_no_numbers_and_the_rest_is_used(bench: Start) -> None:
 
 
 def test_two_clocks_of_one_device_are_told(bench: Start) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
 
     def told_after_another() -> dict[str, int]:
         counter = b.skin.counter = b.skin.counter + 1

@@ -5,20 +5,18 @@ from __future__ import annotations
 import os
 import random
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from fixture_types import Start
 from tactomo import timing
 from tactomo.config import load_config
 from tactomo.errors import PortBusyError, PortError
 from tactomo.service.daemon import Daemon
 from tactomo_protocol import Acknowledge, AckStatus, Channel, CommandCode
-
-Start = Callable[..., Any]
 
 
 def refusal(port: str | Path) -> PortError:
@@ -43,8 +41,7 @@ def refusal(port: str | Path) -> PortError:
 
 
 def test_garbage_is_counted_and_told_in_few_events_and_costs_nothing_else(bench: Start) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     first_s = time.monotonic()
     b.skin.lines[0].say(
         b"\x00" + random.Random(1).randbytes(300).replace(b"\x00", b"\x01") + b"\x00"
@@ -67,8 +64,7 @@ def test_damage_that_is_over_is_not_told_as_present(
     bench: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(timing, "LOOK_S", 0.0)
-    b = bench()
-    b.tare()
+    b = bench().tare()
     b.skin.lines[0].say(b"\x00garbage\x00")
     b.listener.event("corrupt_packets")
     status = b.ask("status")
@@ -85,8 +81,7 @@ def test_damage_that_is_over_is_not_told_as_present(
 
 @pytest.mark.parametrize("ports", [1, 2])
 def test_an_unplugged_port_is_waited_for_and_started_again(bench: Start, ports: int) -> None:
-    b = bench(ports=ports)
-    b.tare()
+    b = bench(ports=ports).tare()
     line = b.skin.lines[0]
     line.unplug()
     assert b.listener.event("port_lost")["severity"] == "error"
@@ -100,8 +95,7 @@ def test_an_unplugged_port_is_waited_for_and_started_again(bench: Start, ports: 
 
 
 def test_the_other_port_goes_on_while_one_is_unplugged(bench: Start) -> None:
-    b = bench(ports=2, sync_wait_ms=100)
-    b.tare()
+    b = bench(ports=2, sync_wait_ms=100).tare()
     b.skin.line_of(Channel.STRUCTURE).unplug()
     b.listener.event("port_lost")
     frame = b.step(load=0.1, channels=(Channel.MAGNITUDE,))
@@ -172,8 +166,7 @@ def test_a_device_of_another_skin_is_refused_by_its_name(bench: Start) -> None:
 
 
 def test_a_device_in_anothers_place_and_a_command_that_it_refuses_are_told(bench: Start) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     line = b.skin.lines[0]
     line.unplug()
     b.listener.event("port_lost")

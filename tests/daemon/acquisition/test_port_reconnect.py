@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 import serial
+from fixture_types import Start
 from tactomo.acquisition.adapters import holders
 from tactomo.acquisition.connection import Connection
 from tactomo.acquisition.liveness import PATIENCE_S
@@ -26,7 +27,6 @@ from tactomo.timing import FEW
 from tactomo_models import load_description
 from tactomo_protocol import CommandCode
 
-Start = Callable[..., Any]
 Connect = Callable[[object], Connection]
 Until = Callable[[Callable[[], Any]], Any]
 Hold = Callable[..., subprocess.Popen[bytes]]
@@ -142,8 +142,7 @@ def test_a_device_may_go_in_the_middle_of_a_call(
 def test_what_stands_in_the_way_is_told_and_waited_out(
     bench: Start, tmp_path: Path, hold: Hold
 ) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     line = b.skin.lines[0]
 
     def lost_because(words: str) -> None:
@@ -181,8 +180,7 @@ def test_a_permission_that_udev_gives_later_is_waited_for(
 
 @pytest.mark.slow
 def test_scans_of_a_newcomer_wait_for_its_hello(bench: Start, until: Until) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     line = b.skin.lines[0]
     line.unplug()
     b.listener.event("port_lost")
@@ -233,8 +231,7 @@ while select.select([port], [], []):
 
 @pytest.mark.slow
 def test_one_who_came_later_is_named(bench: Start, hold: Hold, until: Until) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     line = b.skin.lines[0]
     other = hold(line.path, sys.executable, "-c", THIEF)  # root may, whatever the lock
     named = f"pid {other.pid}: "

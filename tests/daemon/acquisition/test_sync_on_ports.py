@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
+from fixture_types import Start
 from tactomo_client.messages import array_from_wire
 from tactomo_protocol import Channel, SampleFormat, Scan, ScanFlag
 from waiting import PATIENCE_S
-
-Start = Callable[..., Any]
 
 
 @pytest.mark.parametrize(
@@ -22,8 +19,7 @@ Start = Callable[..., Any]
 def test_one_channel_missing_is_flagged_and_the_maps_go_on(
     bench: Start, present: Channel, flag: str
 ) -> None:
-    b = bench(ports=2, lossless=True)
-    b.tare()
+    b = bench(ports=2, lossless=True).tare()
     alone = b.skin.scan(load=0.1, channels=(present,))
     assert b.step()["flags"] == []  # both again: what waited for a partner waited in vain
     frame = b.listener.frame(alone)
@@ -35,8 +31,7 @@ def test_one_channel_missing_is_flagged_and_the_maps_go_on(
 @pytest.mark.slow
 def test_a_channel_that_stays_out_is_lost_and_comes_back(bench: Start) -> None:
     # A wait that would be noticed if every frame had to pay for it.
-    b = bench(ports=2, sync_wait_ms=800)
-    b.tare()
+    b = bench(ports=2, sync_wait_ms=800).tare()
     while not any(e["name"] == "channel_lost" for e in b.listener.of("event")):
         b.step(channels=(Channel.MAGNITUDE,))
     b.until(lambda: b.step(channels=(Channel.MAGNITUDE,))["age_ns"] < 750e6)  # waited for no more
@@ -63,8 +58,7 @@ def test_a_channel_that_comes_after_the_tare_says_that_it_has_no_reference(bench
 
 
 def test_a_scan_that_comes_too_late_is_counted_and_left_out(bench: Start) -> None:
-    b = bench(ports=2, sync_wait_ms=20)
-    b.tare()
+    b = bench(ports=2, sync_wait_ms=20).tare()
     before = b.ask("status")["late_scans"]  # of pairs that a busy computer tore apart
     counter = b.skin.counter + 1
     assert b.step(channels=(Channel.MAGNITUDE,))["flags"] == ["structure_missing"]
@@ -97,8 +91,7 @@ def test_counters_wrap_after_32_bits(bench: Start) -> None:
 
 
 def test_a_saturated_scan_is_used_and_flagged(bench: Start) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     frame = b.step(flags=ScanFlag.SATURATED)
     assert frame["flags"] == ["saturated"]
     assert frame["map"] is not None
@@ -107,8 +100,7 @@ def test_a_saturated_scan_is_used_and_flagged(bench: Start) -> None:
 def test_voltages_that_are_no_numbers_are_left_to_the_models_and_never_tared(
     bench: Start,
 ) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     line = b.skin.lines[0]
     counter = b.skin.counter + 1
     good = np.full(208, 1e5, np.float32)

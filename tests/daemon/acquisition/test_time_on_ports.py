@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixture_types import Start
 from tactomo.log import configure_logging
 from tactomo.recordings.recording import open_recording
 from tactomo.recordings.recording_writer import write_recording
@@ -25,8 +26,6 @@ from tactomo_protocol import (
     ScanFlag,
 )
 
-Start = Callable[..., Any]
-Replay = Callable[..., Any]
 MAGNITUDE, STRUCTURE = Channel.MAGNITUDE, Channel.STRUCTURE
 PERIOD_S = 0.05
 DAY_S = 86_400.0
@@ -57,7 +56,7 @@ def recorded(
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", [0, 60])
 def test_what_waited_in_a_buffer_is_as_old_as_it_is(
-    replay: Replay, tmp_path: Path, speed: float
+    replay: Start, tmp_path: Path, speed: float
 ) -> None:
     held_up = {300 + n: (20 - n) * PERIOD_S for n in range(20)}  # one second of it, at once
     frames = replay(recorded(tmp_path / "late.mcap", held_up), speed=speed, lossless=True).of("map")
@@ -71,7 +70,7 @@ def test_what_waited_in_a_buffer_is_as_old_as_it_is(
 
 
 def test_a_clock_that_jumps_is_said_to_have_jumped(
-    replay: Replay, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    replay: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def wrapped(number: int) -> int:
         return (2**32 - 300 * 50_000 + number * 50_000) % 2**32
@@ -87,11 +86,10 @@ def test_a_clock_that_jumps_is_said_to_have_jumped(
 @pytest.mark.slow
 @pytest.mark.parametrize(("ports", "speed"), [(1, 20), (2, 0)])
 def test_an_exact_replay_has_the_dates_and_flags_of_the_live_run(
-    bench: Start, replay: Replay, tmp_path: Path, ports: int, speed: float
+    bench: Start, replay: Start, tmp_path: Path, ports: int, speed: float
 ) -> None:
     path = tmp_path / "live.mcap"
-    b = bench(ports=ports, recording={"file": path}, sync_wait_ms=30)
-    b.tare()
+    b = bench(ports=ports, recording={"file": path}, sync_wait_ms=30).tare()
     for number in range(8):
         b.skin.scan(channels=(MAGNITUDE,), device_us=10**7 + number * 50_000)
         sent_ns = time.monotonic_ns()
@@ -111,7 +109,7 @@ def test_an_exact_replay_has_the_dates_and_flags_of_the_live_run(
 
 @pytest.mark.slow
 def test_a_recording_of_before_these_dates_replays_with_dates_of_its_own(
-    bench: Start, replay: Replay, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bench: Start, replay: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from dataclasses import replace
 
@@ -119,8 +117,7 @@ def test_a_recording_of_before_these_dates_replays_with_dates_of_its_own(
     from tactomo.recordings.replay import read_replay
 
     path = tmp_path / "live.mcap"
-    b = bench(recording={"file": path})
-    b.tare()
+    b = bench(recording={"file": path}).tare()
     b.step()
     b.daemon.stop()
 
@@ -160,8 +157,7 @@ class Boards:
 
 
 def test_boards_out_of_step_are_flagged_zeroed_and_forgiven(bench: Start) -> None:
-    b = bench(ports=2, sync_wait_ms=50)
-    b.tare()
+    b = bench(ports=2, sync_wait_ms=50).tare()
     boards = Boards(b, magnitude=5000, structure=40)
     boards.commands()
     heard: dict[Channel, list[Command]] = {channel: [] for channel in Channel}
@@ -189,11 +185,10 @@ def test_boards_out_of_step_are_flagged_zeroed_and_forgiven(bench: Start) -> Non
 
 @pytest.mark.slow
 def test_an_exact_replay_knows_what_was_known_when_the_recording_began(
-    bench: Start, replay: Replay, tmp_path: Path
+    bench: Start, replay: Start, tmp_path: Path
 ) -> None:
     path = tmp_path / "live.mcap"
-    b = bench(ports=2, sync_wait_ms=50)
-    b.tare()
+    b = bench(ports=2, sync_wait_ms=50).tare()
     boards = Boards(b, magnitude=5000, structure=40)
     b.until(lambda: boards.scan() and "channels_skewed" in events(b))
     b.ask("record_start", path=path.name)
@@ -206,8 +201,7 @@ def test_an_exact_replay_knows_what_was_known_when_the_recording_began(
 
 
 def test_a_board_that_is_reset_alone_is_never_paired_with_the_other(bench: Start) -> None:
-    b = bench(ports=2, sync_wait_ms=50)
-    b.tare()
+    b = bench(ports=2, sync_wait_ms=50).tare()
     boards = Boards(b, magnitude=100, structure=100)
     b.listener.frame(boards.scan())
     boards.counters[STRUCTURE], boards.device_us[STRUCTURE] = -1, 0
@@ -224,8 +218,7 @@ def events(b: Any) -> set[str]:
 def test_a_wall_clock_set_back_by_a_day_moves_no_age(
     bench: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     before = b.step()
     real = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: real() - round(DAY_S * 1e9))
@@ -247,8 +240,7 @@ def test_a_wall_clock_set_back_by_a_day_moves_no_age(
 @pytest.mark.slow
 @pytest.mark.parametrize("lossless", [True, False])
 def test_every_scan_is_accounted_for(bench: Start, lossless: bool) -> None:
-    b = bench(ports=2, seconds=0.02, lossless=lossless)
-    b.tare()
+    b = bench(ports=2, seconds=0.02, lossless=lossless).tare()
     for number in range(30):
         b.skin.scan(channels=(MAGNITUDE,) if number % 5 == 0 else tuple(Channel))
         if number % 7 == 0:  # once more

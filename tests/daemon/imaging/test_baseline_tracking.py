@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from fixture_types import Start
 from tactomo.recordings.recording import open_recording
 from tactomo_client.messages import array_from_wire
 from tactomo_models import Press, SkinSimulator, load_description
 from tactomo_models.drift import baseline, channel_baseline
-
-Start = Callable[..., Any]
 
 
 @pytest.fixture
@@ -94,6 +92,5 @@ def test_a_change_that_no_skin_makes_is_refused_and_a_tare_helps(
 
 
 def test_off_means_off(bench: Start) -> None:
-    b = bench(baseline={"track": False})
-    b.tare()
+    b = bench(baseline={"track": False}).tare()
     assert b.ask("status")["baseline"]["state"] == "off"

@@ -5,7 +5,6 @@ So it is at the daemon's start, and so when it is read again while the daemon ru
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from daemon_bench import BOTH, MEASUREMENTS, REST
+from fixture_types import Start
 from tactomo.config import load_config
 from tactomo.recordings import recorder
 from tactomo.recordings.recording import open_recording
@@ -27,8 +27,6 @@ from tactomo_models.calibration.calibration_file import (
 )
 from tactomo_models.calibration.curve import Reading
 from tactomo_models.calibration.taught_skin import TaughtSkin, save_taught, taught_path
-
-Start = Callable[..., Any]
 
 SENSOR = load_description("paper_square")
 SUBJECT = Subject(sensor="left", description=SENSOR.name, sha256=SENSOR.sha256)
@@ -91,8 +89,7 @@ def test_a_damaged_one_is_told_and_not_used(bench: Start) -> None:
 
 def test_it_is_not_in_force_with_another_device(bench: Start) -> None:
     kept(device_ids=("skin-elsewhere",))
-    daemon = bench()
-    daemon.tare()
+    daemon = bench().tare()
     refusal = daemon.listener.event("calibration_refused")
     assert "was made with skin-elsewhere, and " in refusal["detail"]
     assert daemon.ask("status")["description"]["calibration"] is None
@@ -112,8 +109,7 @@ def test_another_device_is_judged_by_the_new_one(bench: Start) -> None:
 @pytest.mark.slow
 def test_a_recording_takes_it_along(bench: Start, replay: Start, tmp_path: Path) -> None:
     kept()
-    daemon = bench(recording={"file": tmp_path / "press.mcap"})
-    daemon.tare()
+    daemon = bench(recording={"file": tmp_path / "press.mcap"}).tare()
     daemon.step(load=0.5)
     daemon.ask("record_stop")
     calibration_path("left").unlink()
@@ -124,8 +120,7 @@ def test_a_recording_takes_it_along(bench: Start, replay: Start, tmp_path: Path)
 
 
 def test_a_new_one_is_in_force_at_once_and_one_that_was_deleted_no_more(bench: Start) -> None:
-    daemon = bench()
-    daemon.tare()
+    daemon = bench().tare()
 
     def in_force() -> tuple[Any, float]:
         description = daemon.ask("status")["description"]
@@ -152,8 +147,7 @@ def test_a_new_one_is_in_force_at_once_and_one_that_was_deleted_no_more(bench: S
 
 def test_one_that_cannot_be_used_leaves_the_one_in_force(bench: Start) -> None:
     made = kept()
-    daemon = bench()
-    daemon.tare()
+    daemon = bench().tare()
     for changes, said in (
         ({"sha256": "0" * 64}, "sha256 000000000000"),
         ({"device_ids": ("skin-elsewhere",)}, "was made with skin-elsewhere, and bench-1 is"),
@@ -295,8 +289,7 @@ def test_files_that_were_cut_replay_by_the_calibration_of_each(
 @pytest.mark.slow
 def test_an_exact_replay_does_not_look_for_another(bench: Start, tmp_path: Path) -> None:
     made = kept()
-    b = bench(recording={"file": tmp_path / "press.mcap"})
-    b.tare()
+    b = bench(recording={"file": tmp_path / "press.mcap"}).tare()
     b.step(load=0.5)
     b.ask("record_stop")
     kept(factor=1.1)
@@ -341,8 +334,7 @@ def taught(**changes: Any) -> TaughtSkin:
 @pytest.mark.slow
 def test_what_was_taught_is_found_by_the_sensors_name_and_told(bench: Start) -> None:
     made = taught()
-    daemon = bench()
-    daemon.tare()
+    daemon = bench().tare()
     told = daemon.ask("status")["description"]["taught"]
     assert told == {
         **{"taken": made.taken, "presses": 40},
@@ -383,8 +375,7 @@ def test_what_was_taught_on_another_skin_is_not_used(
     taught(**(changes or {}))
     if changes is None:
         taught_path("left").write_bytes(b"PK")
-    daemon = bench()
-    daemon.tare()
+    daemon = bench().tare()
     status = daemon.ask("status")
     (trouble,) = status["events"]["troubles"]
     assert said in trouble["detail"]
@@ -395,6 +386,5 @@ def test_what_was_taught_on_another_skin_is_not_used(
 
 def test_a_sheet_that_drifts_evenly_is_the_one_that_was_taught(bench: Start) -> None:
     taught(reference=0.8 * np.stack([REST, REST]))
-    daemon = bench()
-    daemon.tare()
+    daemon = bench().tare()
     assert daemon.ask("status")["description"]["taught"] is not None

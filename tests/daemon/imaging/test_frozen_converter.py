@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from daemon_bench import BOTH, REST, scan
+from fixture_types import Start
 from tactomo_protocol import Channel
-
-Start = Callable[..., Any]
 
 
 def freeze(b: Any, frozen: tuple[Channel, ...], load: float) -> dict[str, Any]:
@@ -27,8 +25,7 @@ def freeze(b: Any, frozen: tuple[Channel, ...], load: float) -> dict[str, Any]:
 
 @pytest.mark.parametrize("frozen", [(Channel.MAGNITUDE,), (Channel.STRUCTURE,), BOTH])
 def test_a_frozen_channel_is_missing_and_told(bench: Start, frozen: tuple[Channel, ...]) -> None:
-    b = bench(ports=2, lossless=True)
-    b.tare()
+    b = bench(ports=2, lossless=True).tare()
     freeze(b, frozen, 0.1)  # the first one repeats nothing
     flags = {f"{channel}_missing" for channel in frozen}
     for _ in range(3):
@@ -45,8 +42,7 @@ def test_a_frozen_channel_is_missing_and_told(bench: Start, frozen: tuple[Channe
 
 
 def test_a_round_of_buffers_that_are_sent_again_is_no_measurement(bench: Start) -> None:
-    b = bench(ports=2, lossless=True)
-    b.tare()
+    b = bench(ports=2, lossless=True).tare()
     for number in range(9):
         b.skin.counter += 1
         for channel in BOTH:
@@ -59,8 +55,7 @@ def test_a_round_of_buffers_that_are_sent_again_is_no_measurement(bench: Start) 
 
 
 def test_drives_that_repeat_are_left_out_and_the_rest_is_imaged(bench: Start) -> None:
-    b = bench(ports=2, lossless=True)
-    b.tare()
+    b = bench(ports=2, lossless=True).tare()
     stuck = replace(scan(Channel.STRUCTURE, 1), counter=0).samples
     for _ in range(3):
         b.skin.counter += 1

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fixture_types import Start
 from tactomo.imaging.kept_reference import reference_path
 from tactomo_client.schema import TOUCHES_SEEN
 from tactomo_models import Press, SkinSimulator, load_description
 from tactomo_models.arrays import FloatArray
 from tactomo_protocol import Channel
 
-Start = Callable[..., Any]
 Volts = Mapping[Channel, FloatArray]
 HELD = [Press(x, y, 180.0) for x in (-0.03, 0.03) for y in (-0.03, 0.03)]
 

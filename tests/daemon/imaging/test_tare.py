@@ -35,8 +35,7 @@ def test_frames_go_on_against_the_last_reference_until_the_new_one_is_understood
     understood = threading.Event()
     understood.set()
     hold_takes(monkeypatch, lambda: understood.wait(60))
-    b = bench()
-    b.tare()
+    b = bench().tare()
     understood.clear()
     with ThreadPoolExecutor(1) as terminal:
         answer = terminal.submit(b.ask, "tare")
@@ -112,8 +111,7 @@ def tare_under(b: Any, load: float, asked: int = 1) -> list[dict[str, Any]]:
 def test_a_tare_under_a_press_is_disputed_until_the_skin_is_at_rest(
     bench: Callable[..., Any],
 ) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     assert b.step(0.2)["flags"] == []
     [answer] = tare_under(b, 0.2)
     assert answer["contacts"] == 1
@@ -131,8 +129,7 @@ def test_a_tare_under_a_press_is_disputed_until_the_skin_is_at_rest(
 def test_a_light_press_is_no_rest_by_the_reference_before_the_tare(
     bench: Callable[..., Any],
 ) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     b.step(0.2)
     tare_under(b, 5e-4)  # 0.05 % of the voltages: 20 times the noise
     assert b.step(5e-4)["flags"] == ["reference_disputed"]
@@ -140,8 +137,7 @@ def test_a_light_press_is_no_rest_by_the_reference_before_the_tare(
 
 
 def test_a_second_tare_with_nothing_shown_settles_it(bench: Callable[..., Any]) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     b.step(0.2)
     tare_under(b, 0.2)
     b.until(lambda: abs(pressed(b.step(0.2))) < 0.01)
@@ -161,8 +157,7 @@ def test_who_asks_while_a_reference_is_found_out_about_shares_the_next_one(
         understood.wait(60)
 
     hold_takes(monkeypatch, find)
-    b = bench()
-    b.tare()
+    b = bench().tare()
     understood.clear()
     first = threading.Thread(target=b.ask, args=("tare",))
     first.start()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from daemon_bench import maps_of
+from fixture_types import Start
 from recorded_grasp import write_grasp
 from tactomo.config import load_config
 from tactomo.errors import ConfigError, PortError, RecordingError
@@ -26,9 +26,6 @@ from tactomo_client.recording import open_recording as open_frames
 from tactomo_client.recording_file import intact_chunks
 from tactomo_models import Reference
 from tactomo_protocol import Channel, Decoder, Hello, SampleFormat, Scan, ScanFlag, encode
-
-Start = Callable[..., Any]
-Replay = Callable[..., Any]
 
 
 def assert_same(live: dict[int, Any], again: dict[int, Any]) -> None:
@@ -69,7 +66,7 @@ def tare_and_step(b: Any) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("ports", "speed"), [(1, 20), (2, 0)])
 def test_a_replay_gives_the_maps_of_the_live_run(
-    bench: Start, replay: Replay, tmp_path: Path, ports: int, speed: float
+    bench: Start, replay: Start, tmp_path: Path, ports: int, speed: float
 ) -> None:
     path = tmp_path / "life.mcap"
     live = record_a_life(bench(ports=ports, sync_wait_ms=100), path)
@@ -78,11 +75,10 @@ def test_a_replay_gives_the_maps_of_the_live_run(
 
 @pytest.mark.slow
 def test_a_recording_that_begins_in_the_middle_of_a_packet_has_it_whole(
-    bench: Start, replay: Replay, tmp_path: Path
+    bench: Start, replay: Start, tmp_path: Path
 ) -> None:
     path = tmp_path / "skin.mcap"
-    b = bench()
-    b.tare()
+    b = bench().tare()
     samples = np.full(208, 100_000, np.int32)
     frames = b"".join(encode(Scan(c, 500, 0, ScanFlag(0), samples)) for c in Channel)
     (port,) = b.ask("status")["ports"]
@@ -98,11 +94,10 @@ def test_a_recording_that_begins_in_the_middle_of_a_packet_has_it_whole(
 
 @pytest.mark.slow
 def test_a_replay_leaves_out_what_the_live_run_dropped(
-    bench: Start, replay: Replay, tmp_path: Path
+    bench: Start, replay: Start, tmp_path: Path
 ) -> None:
     path = tmp_path / "slow.mcap"
-    b = bench(seconds=0.03)
-    b.tare()
+    b = bench(seconds=0.03).tare()
     b.ask("record_start", path=path.name)
     start = b.skin.counter
     for index in range(40):
@@ -132,8 +127,7 @@ def test_a_frame_that_was_seen_is_in_the_recording(
 
     monkeypatch.setattr(module, name, slowly)
     path = tmp_path / "seen.mcap"
-    b = bench()
-    b.tare()
+    b = bench().tare()
     b.ask("record_start", path=path.name, maps=True)
     seen = b.step(load=0.1)
     b.ask("record_stop")
@@ -143,11 +137,10 @@ def test_a_frame_that_was_seen_is_in_the_recording(
 
 @pytest.mark.slow
 def test_the_method_and_time_of_each_frame_are_again(
-    bench: Start, replay: Replay, tmp_path: Path
+    bench: Start, replay: Start, tmp_path: Path
 ) -> None:
     path = tmp_path / "budget.mcap"
-    b = bench(recording={"file": path})
-    b.tare()
+    b = bench(recording={"file": path}).tare()
     for tier, budget_ms in (("auto", 12), ("auto", 3), ("noser", None)):
         b.ask("set_tier", tier=tier)
         b.ask("set_budget", budget_ms=budget_ms)
@@ -173,8 +166,7 @@ def test_a_recording_whose_frames_were_made_by_the_hybrid_opens(tmp_path: Path) 
 
 def test_a_recording_knows_what_is_in_it(bench: Start, tmp_path: Path) -> None:
     path = tmp_path / "skin.mcap"
-    b = bench(ports=2, recording={"file": path})
-    b.tare()
+    b = bench(ports=2, recording={"file": path}).tare()
     b.skin.lines[0].say(b"\x00noise\x00")
     b.step()
     b.until(lambda: b.ask("status")["recording"]["bytes"] > 0)
@@ -193,8 +185,7 @@ def test_a_recording_knows_what_is_in_it(bench: Start, tmp_path: Path) -> None:
 
 def test_a_recording_has_the_frames_that_were_published(bench: Start, tmp_path: Path) -> None:
     path = tmp_path / "frames.mcap"
-    b = bench()
-    b.tare()
+    b = bench().tare()
     b.ask("record_start", path=path.name, maps=True)
     first = b.skin.counter + 1
     for load in (0.1, 0.2):
@@ -238,8 +229,7 @@ def test_recordings_go_below_the_configured_folder_alone(bench: Start, tmp_path:
 
 
 def test_one_recording_at_a_time_and_as_many_as_wanted(bench: Start, tmp_path: Path) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     for number in range(3):
         path = tmp_path / f"{number}.mcap"
         b.ask("record_start", path=path.name)
@@ -275,7 +265,7 @@ def imported(path: Path, reference: Reference | None = None, **hello: Any) -> li
 @pytest.mark.slow
 @pytest.mark.parametrize("speed", [0, 30])
 def test_imported_scans_are_tared_and_reconstructed_one_by_one(
-    replay: Replay, tmp_path: Path, speed: float
+    replay: Start, tmp_path: Path, speed: float
 ) -> None:
     path = tmp_path / "two words & %.mcap"
     imported(path)
@@ -286,7 +276,7 @@ def test_imported_scans_are_tared_and_reconstructed_one_by_one(
     assert array_from_wire(frames[-1]["map"])[0, 0] == pytest.approx(0.2, rel=1e-3)
 
 
-def test_an_imported_reference_is_used_from_the_first_scan(replay: Replay, tmp_path: Path) -> None:
+def test_an_imported_reference_is_used_from_the_first_scan(replay: Start, tmp_path: Path) -> None:
     path = tmp_path / "tank.mcap"
     volts = np.linspace(0.05, 0.2, 208)
     imported(path, Reference.from_scans(np.stack([volts, volts * 1.0001]), None))
@@ -304,7 +294,7 @@ def test_a_recording_of_another_sensor_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_replay_without_pauses_writes_chunks_as_small_as_a_live_one(
-    replay: Replay, tmp_path: Path
+    replay: Start, tmp_path: Path
 ) -> None:
     path = tmp_path / "tank.mcap"
     imported(path)

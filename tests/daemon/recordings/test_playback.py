@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from daemon_bench import HELLO, Bench, Listener, Memory, scan
+from fixture_types import Start
 from tactomo.config import load_config
 from tactomo.imaging.imaging import MOVED_BUDGET_MS
 from tactomo.protocols import protocol_named
@@ -22,8 +23,6 @@ from tactomo_client import ControlError
 from tactomo_client.messages import array_from_wire
 from tactomo_models import load_description
 from tactomo_protocol import Channel, Scan, encode
-
-Start = Callable[..., Any]
 
 
 @pytest.fixture
@@ -75,8 +74,7 @@ class Life(NamedTuple):
 @pytest.fixture(params=[pytest.param(1, marks=pytest.mark.slow), 2])
 def life(request: pytest.FixtureRequest, bench: Start, tmp_path: Path) -> Life:
     path = tmp_path / "life.mcap"
-    b = bench(ports=request.param)
-    b.tare()
+    b = bench(ports=request.param).tare()
     b.ask("record_start", path=path.name)
     first = b.skin.counter + 1
     for index in range(8):
@@ -293,8 +291,7 @@ def test_a_move_into_the_middle_of_a_packet_is_no_damage(play: Any, torn: Path) 
 def test_a_replay_sends_nobody_to_a_cable_that_is_not_there(
     bench: Start, play: Any, tmp_path: Path
 ) -> None:
-    live = bench()
-    live.tare()
+    live = bench().tare()
     live.ask("record_start", path="noisy.mcap")
     live.step()
     live.skin.lines[0].say(b"\x00noise on the line\x00")

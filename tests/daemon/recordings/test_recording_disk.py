@@ -19,13 +19,13 @@ from typing import Any
 
 import pytest
 from daemon_bench import scan_counters
+from fixture_types import Start
 from tactomo.recordings import active_recording, recorder
 from tactomo.recordings.recording import open_recording
 from tactomo.recordings.recovery import recover
 from tactomo_client import ControlError, request
 from waiting import wait_until
 
-Start = Callable[..., Any]
 EXT4_SHUTDOWN = 0x8004587D
 NO_LOG_FLUSH = struct.pack("<I", 2)
 
@@ -105,8 +105,7 @@ def test_a_full_disk_is_recorded_to_again_once_it_has_room(
     folder = small_disk / "set"
     b = bench(
         recording={"folder": folder, "at_start": True, "reserve_mb": reserve_mb, "maps": True}
-    )
-    b.tare()
+    ).tare()
     filler = fill(small_disk, 600_000)
     step_until(b, lambda: told(b, "recording_failed"))
     failed = told(b, "recording_failed")[0]
@@ -135,8 +134,7 @@ def test_a_full_disk_is_recorded_to_again_once_it_has_room(
 def test_a_recording_to_one_file_ends_with_the_room_and_can_be_recovered(
     bench: Start, small_disk: Path, tmp_path: Path
 ) -> None:
-    b = bench(recording={"reserve_mb": 0, "maps": True, "folder": small_disk})
-    b.tare()
+    b = bench(recording={"reserve_mb": 0, "maps": True, "folder": small_disk}).tare()
     path = small_disk / "one.mcap"
     b.ask("record_start", path=path.name)
     first = b.skin.counter + 1
@@ -161,8 +159,7 @@ def test_a_stuck_disk_holds_up_nothing_and_costs_nothing(
 ) -> None:
     disk, turn = stuck_disk
     path = disk / "a.mcap"
-    b = bench(recording={"file": path})
-    b.tare()
+    b = bench(recording={"file": path}).tare()
     b.until(lambda: b.ask("status")["recording"]["bytes"] > 3000)
     turn("-f")
     begin = b.skin.counter
@@ -188,8 +185,7 @@ def test_a_disk_that_stays_stuck_ends_the_recording_when_enough_waits(
 ) -> None:
     monkeypatch.setattr(active_recording, "MAX_QUEUED_BYTES", 200_000)
     disk, turn = stuck_disk
-    b = bench(recording={"folder": disk / "set", "at_start": True})
-    b.tare()
+    b = bench(recording={"folder": disk / "set", "at_start": True}).tare()
     turn("-f")
     step_until(b, lambda: told(b, "recording_failed"))
     assert "too slow" in told(b, "recording_failed")[0]["detail"]
@@ -213,8 +209,7 @@ def test_the_daemon_stops_although_the_disk_does_not_answer(
     bench: Start, stuck_disk: tuple[Path, Callable[[str], None]]
 ) -> None:
     disk, turn = stuck_disk
-    b = bench(recording={"file": disk / "a.mcap"})
-    b.tare()
+    b = bench(recording={"file": disk / "a.mcap"}).tare()
     turn("-f")
     b.step()
     with pytest.raises(ControlError):
@@ -231,8 +226,7 @@ def test_the_daemon_stops_although_the_disk_does_not_answer(
 
 def test_a_disk_that_dies(bench: Start, ext4_disk: Path, tmp_path: Path) -> None:
     path = ext4_disk / "a.mcap"
-    b = bench(recording={"file": path})
-    b.tare()
+    b = bench(recording={"file": path}).tare()
     with path.open("rb") as file:
         fcntl.ioctl(file, EXT4_SHUTDOWN, NO_LOG_FLUSH)
     step_until(b, lambda: told(b, "recording_failed"))
@@ -256,8 +250,7 @@ def test_what_comes_while_the_disk_is_asked_to_keep_it_is_written(
         keep(descriptor)
 
     monkeypatch.setattr(os, "fdatasync", slow)
-    b = bench(recording={"sync_s": 0.05})
-    b.tare()
+    b = bench(recording={"sync_s": 0.05}).tare()
     path = tmp_path / "kept.mcap"
     b.ask("record_start", path=path.name)
     b.step()
@@ -273,8 +266,7 @@ def test_what_comes_while_the_disk_is_asked_to_keep_it_is_written(
 def test_a_deleted_file_or_folder_is_noticed(bench: Start, tmp_path: Path) -> None:
     folder = tmp_path / "set"
     path = folder / "one.mcap"
-    b = bench(recording={"folder": folder})
-    b.tare()
+    b = bench(recording={"folder": folder}).tare()
     b.ask("record_start", path=path.name)
     path.unlink()
     step_until(b, lambda: told(b, "recording_failed"))
@@ -288,8 +280,7 @@ def test_a_deleted_file_or_folder_is_noticed(bench: Start, tmp_path: Path) -> No
 
 
 def test_a_file_that_is_moved_is_written_on(bench: Start, tmp_path: Path) -> None:
-    b = bench(recording={"file": tmp_path / "a.mcap"})
-    b.tare()
+    b = bench(recording={"file": tmp_path / "a.mcap"}).tare()
     (tmp_path / "a.mcap").rename(tmp_path / "b.mcap")
     b.step()
     b.daemon.stop()
@@ -301,8 +292,7 @@ def test_a_folder_that_takes_no_new_file_leaves_the_present_one_going(
     bench: Start, ext4_disk: Path
 ) -> None:
     folder = ext4_disk / "set"
-    b = bench(recording={"folder": folder, "at_start": True, "rotate_mb": 0.01})
-    b.tare()
+    b = bench(recording={"folder": folder, "at_start": True, "rotate_mb": 0.01}).tare()
     (first,) = folder.iterdir()
     subprocess.run(["chattr", "+i", str(folder)], check=True)
     try:
@@ -323,8 +313,7 @@ def test_a_folder_that_cannot_be_made_does_not_keep_the_daemon_from_starting(
     bench: Start, tmp_path: Path
 ) -> None:
     (tmp_path / "file").write_text("")
-    b = bench(recording={"folder": tmp_path / "file" / "set", "at_start": True})
-    b.tare()
+    b = bench(recording={"folder": tmp_path / "file" / "set", "at_start": True}).tare()
     assert "cannot create" in b.ask("status")["recorder"]["waits_for"]
     (tmp_path / "file").unlink()
     step_until(b, lambda: told(b, "recording_resumed"))
@@ -334,8 +323,7 @@ def test_a_folder_that_cannot_be_made_does_not_keep_the_daemon_from_starting(
 def test_a_mistake_of_ours_ends_the_recording_and_a_dead_recorder_is_told_of(
     bench: Start, tmp_path: Path
 ) -> None:
-    b = bench(recording={"file": tmp_path / "a.mcap"})
-    b.tare()
+    b = bench(recording={"file": tmp_path / "a.mcap"}).tare()
     write = b.daemon._recorder._write
 
     def fail() -> None:

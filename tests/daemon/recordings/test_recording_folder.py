@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from daemon_bench import maps_of, scan_counters
+from fixture_types import Start
 from tactomo.config import RecordingConfig
 from tactomo.recordings import recorder
 from tactomo.recordings.recording import Origin, open_recording
@@ -18,7 +17,6 @@ from tactomo.recordings.recording_writer import RecordingWriter
 from tactomo.recordings.rotation import KeptRecording, list_recordings, to_delete
 from tactomo_protocol import Channel
 
-Start = Callable[..., Any]
 DAY_S = 86_400.0
 
 
@@ -31,8 +29,7 @@ def test_each_file_replays_alone_and_together_they_have_every_frame_once(
     folder = tmp_path / "set"
     b = bench(
         ports=ports, recording={"folder": folder, "at_start": True, "rotate_mb": 0.01, "maps": True}
-    )
-    b.tare()
+    ).tare()
     load = 0.0
     while b.ask("status")["recorder"]["files"] < 4:
         load = (load + 0.01) % 0.4
@@ -90,8 +87,7 @@ def test_the_oldest_files_of_this_sensor_go_when_there_are_too_many(
 ) -> None:
     folder = tmp_path / "set"
     rules = {"folder": folder, "rotate_mb": 0.01, "keep_gb": 0.00006}
-    b = bench(recording=rules)
-    b.tare()
+    b = bench(recording=rules).tare()
     made = []
     for _ in range(6):
         b.ask("record_start")

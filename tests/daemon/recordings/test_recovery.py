@@ -5,13 +5,13 @@ from __future__ import annotations
 import functools
 import json
 import random
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from daemon_bench import scan_counters
+from fixture_types import Run, Start
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -32,8 +32,6 @@ from tactomo_client.recording_file import intact_chunks
 from tactomo_models import Reference
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag, encode
 
-Start = Callable[..., Any]
-Run = Callable[..., Any]
 PERIOD_NS = 50_000_000
 SCANS = 40
 RECALIBRATED = 30
@@ -353,8 +351,7 @@ def test_a_replay_after_recovery_gives_the_live_maps(
     bench: Start, replay: Start, tmp_path: Path
 ) -> None:
     path, damaged = tmp_path / "life.mcap", tmp_path / "damaged.mcap"
-    b = bench(ports=2, recording={"file": path})
-    b.tare()
+    b = bench(ports=2, recording={"file": path}).tare()
     for index in range(60):
         size = path.stat().st_size
         b.step(load=0.004 * index)
@@ -387,8 +384,7 @@ def test_the_command_says_what_was_kept_and_lost(tactomo: Run, tmp_path: Path) -
     data = bytearray(whole())
     data[chunks()[4][0] + 70] ^= 1
     (tmp_path / "a.mcap").write_bytes(data[: chunks()[-3][0]])
-    result = tactomo("recover", "a.mcap")
-    assert result.returncode == 0, result.stderr
+    result = tactomo("recover", "a.mcap", status=0)
     assert "1.7 s, 32 magnitude, 32 structure scans" in result.stdout
     assert "a gap of 0.15 s: 2 magnitude, 2 structure scans" in result.stdout
     assert "the end" in result.stdout
@@ -398,11 +394,9 @@ def test_the_command_says_what_was_kept_and_lost(tactomo: Run, tmp_path: Path) -
     facts = json.loads(tactomo("info", "a.mcap", "--json").stdout)
     assert facts["complete"] is False
     assert "intact data beyond; `tactomo recover`" in facts["ends"]
-    again = tactomo("recover", "a.mcap")
-    assert again.returncode == 1
+    again = tactomo("recover", "a.mcap", status=1)
     assert "exists already" in again.stderr
-    folder = tactomo("recover", ".")
-    assert folder.returncode == 1
+    folder = tactomo("recover", ".", status=1)
     assert folder.stderr.strip().endswith("it is no regular file; give the path of a .mcap file")
 
 

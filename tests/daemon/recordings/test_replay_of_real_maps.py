@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from fixture_types import Start
 from tactomo.recordings.recording import open_recording
 from tactomo_client.messages import array_from_wire
 from tactomo_models import Press, SensorDescription, SkinSimulator, load_description
@@ -20,7 +20,6 @@ from tactomo_models.calibration.calibration_file import (
 from tactomo_models.calibration.curve import Reading
 from tactomo_protocol import Channel
 
-Start = Callable[..., Any]
 IMAGES = ("map", "pressure_kpa", "structure")
 
 

@@ -14,13 +14,12 @@ from typing import Any
 
 import pytest
 from daemon_process import DaemonProcess
+from fixture_types import Start
 from tactomo.config import load_config
 from tactomo.errors import ConfigError, TactomoError
 from tactomo.recordings.recording import open_recording
 from tactomo.service.daemon import Daemon
 from waiting import PATIENCE_S, wait_until
-
-Start = Callable[..., Any]
 
 # What `tactomo daemon` does, with a reconstructor that needs no artifact.
 PROGRAM = """
@@ -66,8 +65,7 @@ def test_nothing_is_left_after_a_stop(bench: Start, tmp_path: Path) -> None:
     bench().daemon.stop()  # what the libraries keep for good is there now
     threads = set(threading.enumerate())
     before = len(os.listdir("/proc/self/fd"))
-    b = bench(ports=2, recording={"file": tmp_path / "skin.mcap"})
-    b.tare()
+    b = bench(ports=2, recording={"file": tmp_path / "skin.mcap"}).tare()
     begin_s = time.monotonic()
     b.daemon.stop()
     assert time.monotonic() - begin_s < 10.0  # a third of a second, on a machine with time to spare

@@ -14,6 +14,7 @@ from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 import pytest
+from fixture_types import Start
 from prometheus_client import parser
 from tactomo.config import load_config
 from tactomo.errors import AddressError, ConfigError
@@ -22,8 +23,6 @@ from waiting import PATIENCE_S
 
 RULES = Path(__file__).parents[3] / "deploy/prometheus/tactomo.rules.yml"
 ANYWHERE = "127.0.0.1:0"
-
-Bench = Callable[..., Any]
 
 
 def scrape(daemon: Any) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
@@ -44,7 +43,7 @@ def key(name: str, **labels: str) -> tuple[str, frozenset[tuple[str, str]]]:
     return f"tactomo_{name}", frozenset(labels.items())
 
 
-def test_only_who_names_this_computer_is_answered(bench: Bench) -> None:
+def test_only_who_names_this_computer_is_answered(bench: Start) -> None:
     address = bench(ports=1, metrics=ANYWHERE).daemon.metrics_address
     with urlopen(Request(address, headers={"Host": "localhost:1"}), timeout=30) as answer:
         assert b"tactomo_" in answer.read()
@@ -55,9 +54,8 @@ def test_only_who_names_this_computer_is_answered(bench: Bench) -> None:
     assert b"tactomo_" not in refused.value.read()
 
 
-def test_a_scrape_says_what_the_status_says(bench: Bench, tmp_path: Path) -> None:
-    made = bench(ports=1, metrics=ANYWHERE, recording={"file": tmp_path / "a.mcap"})
-    made.tare()
+def test_a_scrape_says_what_the_status_says(bench: Start, tmp_path: Path) -> None:
+    made = bench(ports=1, metrics=ANYWHERE, recording={"file": tmp_path / "a.mcap"}).tare()
     made.step(load=0.5)
     made.skin.lines[0].say(b"\1\2\3\0")
     made.listener.event("corrupt_packets")
@@ -82,7 +80,7 @@ def test_a_scrape_says_what_the_status_says(bench: Bench, tmp_path: Path) -> Non
     assert found["process_resident_memory_bytes", frozenset()] > 1e7
 
 
-def test_what_is_unknown_is_left_out_and_the_rules_name_what_there_is(bench: Bench) -> None:
+def test_what_is_unknown_is_left_out_and_the_rules_name_what_there_is(bench: Start) -> None:
     assert bench(ports=1).daemon.metrics_address == ""  # none where there is no key
     daemon = bench(ports=1, metrics=ANYWHERE).daemon
     names = {name for name, _ in scrape(daemon)}
@@ -93,11 +91,10 @@ def test_what_is_unknown_is_left_out_and_the_rules_name_what_there_is(bench: Ben
 
 
 def test_a_slow_scraper_disturbs_nobody_and_does_not_hold_up_the_stop(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+    bench: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(metrics._Handler, "timeout", PATIENCE_S)
-    made = bench(ports=1, metrics=ANYWHERE)
-    made.tare()
+    made = bench(ports=1, metrics=ANYWHERE).tare()
     port = int(made.daemon.metrics_address.split(":")[2].split("/")[0])
     with socket.create_connection(("127.0.0.1", port)) as slow:
         slow.sendall(b"GET /met")
@@ -109,7 +106,7 @@ def test_a_slow_scraper_disturbs_nobody_and_does_not_hold_up_the_stop(
         assert time.monotonic() - begin_s < PATIENCE_S / 2, "less than the scraper's time"
 
 
-def test_a_port_in_use_is_named_and_nothing_recorded(bench: Bench, tmp_path: Path) -> None:
+def test_a_port_in_use_is_named_and_nothing_recorded(bench: Start, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         taken = f"127.0.0.1:{other.getsockname()[1]}"
         with pytest.raises(AddressError, match=f"cannot offer metrics at {taken}") as caught:

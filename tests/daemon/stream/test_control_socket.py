@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,6 +10,7 @@ import msgpack  # type: ignore[import-untyped]
 import pytest
 import zmq
 from daemon_bench import Memory
+from fixture_types import Start
 from tactomo.config import load_config
 from tactomo.errors import AddressError
 from tactomo.service.daemon import Daemon
@@ -18,8 +18,6 @@ from tactomo.stream import control
 from tactomo_client import ControlError
 from tactomo_client.messages import decode_reply, encode_request
 from waiting import PATIENCE_S
-
-Start = Callable[..., Any]
 
 
 def test_status_says_how_everything_is(bench: Start) -> None:
@@ -46,8 +44,7 @@ def test_status_says_how_everything_is(bench: Start) -> None:
 
 @pytest.mark.slow
 def test_rates_are_what_comes_and_nothing_when_nothing_comes(bench: Start) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     b.until(
         lambda: (
             b.step()
@@ -64,8 +61,7 @@ def test_rates_are_what_comes_and_nothing_when_nothing_comes(bench: Start) -> No
 def test_two_hundred_tares_at_once_are_all_answered(
     bench: Start, connect: Start, sockets: int
 ) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     askers = [connect(zmq.DEALER, b.daemon.control_address) for _ in range(sockets)]
     for number in range(200):
         askers[number % sockets].send_multipart([b"", encode_request("tare", {})])
@@ -81,8 +77,7 @@ def test_two_hundred_tares_at_once_are_all_answered(
 
 
 def test_tare_is_refused_while_somebody_presses(bench: Start) -> None:
-    b = bench(tare_scans=10)
-    b.tare()
+    b = bench(tare_scans=10).tare()
     reference = b.ask("status")["reference"]
     errors: list[ControlError] = []
 
@@ -129,8 +124,7 @@ def test_tier_and_budget_are_answered_when_they_are_in_force(
     bench: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(control, "SETTLE_S", PATIENCE_S)
-    b = bench(seconds=0.2)
-    b.tare()
+    b = bench(seconds=0.2).tare()
     for tier, budget_ms in [("levelset", 25.0), ("fit", 30.0), ("tikhonov", None)]:
         b.skin.scan()  # a frame that takes its time, and the commands come meanwhile
         assert b.ask("set_tier", tier=tier) == {"tier": tier}

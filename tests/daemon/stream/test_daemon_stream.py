@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import zmq
+from fixture_types import Start
 from tactomo.service import status
 from tactomo_client import subscribe
 from tactomo_client.messages import array_from_wire, decode_message, topic
 from waiting import PATIENCE_S
-
-Start = Callable[..., Any]
 
 
 def test_every_message_carries_the_envelope(bench: Start) -> None:
@@ -46,8 +44,7 @@ def test_frames_before_the_first_reference_say_so(bench: Start) -> None:
 
 
 def test_the_client_reads_maps_and_contacts(bench: Start) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     with (
         subscribe("left", address=b.daemon.stream_address, timeout_s=30) as maps,
         subscribe("left", address=b.daemon.stream_address, kind="contacts", timeout_s=30) as few,
@@ -66,8 +63,7 @@ def test_the_client_reads_maps_and_contacts(bench: Start) -> None:
 
 
 def test_the_scan_topic_carries_the_voltages_in_volts(bench: Start) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     counter = b.skin.scan()
     scan = b.listener.wait("scan", lambda s: s["scan_counter"] == counter)
     assert array_from_wire(scan["magnitude"]) == pytest.approx(
@@ -78,8 +74,7 @@ def test_the_scan_topic_carries_the_voltages_in_volts(bench: Start) -> None:
 
 @pytest.mark.slow
 def test_a_late_joiner_gets_the_status_at_once(bench: Start, connect: Start) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     b.until(lambda: len(b.listener.of("status")) >= 2)
 
     def is_repeated() -> bool:
@@ -97,8 +92,7 @@ def test_a_late_joiner_gets_the_status_at_once(bench: Start, connect: Start) -> 
 
 
 def test_a_frame_that_was_heard_is_counted(bench: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     publish, is_asked = b.daemon._publisher.publish, threading.Event()
 
     def held_up(kind: str, *given: Any) -> None:
@@ -112,8 +106,7 @@ def test_a_frame_that_was_heard_is_counted(bench: Start, monkeypatch: pytest.Mon
 
 
 def test_a_map_is_made_for_subscribers_alone(bench: Start) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     b.step()  # its map has come, and so have all before it
     # Unsubscribe from maps; contacts and the rest go on.
     b.listener.socket.setsockopt(zmq.UNSUBSCRIBE, topic("left", "map"))
@@ -131,8 +124,7 @@ def test_a_map_is_made_for_subscribers_alone(bench: Start) -> None:
 
 @pytest.mark.slow
 def test_a_stalled_subscriber_slows_nobody(bench: Start, connect: Start) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     connect(zmq.SUB, b.daemon.stream_address, b"", rcvhwm=1)
     b.until(lambda: b.ask("status")["subscribers"] == 6)
     start = b.skin.counter
@@ -144,8 +136,7 @@ def test_a_stalled_subscriber_slows_nobody(bench: Start, connect: Start) -> None
 
 
 def test_the_newest_scan_wins_when_the_reconstruction_lags(bench: Start) -> None:
-    b = bench(seconds=0.05)
-    b.tare()
+    b = bench(seconds=0.05).tare()
     start = b.skin.counter
     for _ in range(40):
         b.skin.scan()
@@ -161,8 +152,7 @@ def test_where_frames_lag_the_state_is_late_and_not_that_no_scans_come(
     bench: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(status, "STALE_S", 0.2)
-    b = bench()
-    b.tare()
+    b = bench().tare()
     for _ in range(5):
         b.step()
     b.daemon._imaging._reconstructor.seconds = 1.5  # far above the frames' pace until now
@@ -179,8 +169,7 @@ def test_where_frames_lag_the_state_is_late_and_not_that_no_scans_come(
 def test_a_reconstruction_that_fails_costs_its_frame_alone(
     bench: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     memory = b.daemon._imaging._reconstructor
     solve = memory.solve
 

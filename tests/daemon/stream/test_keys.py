@@ -9,12 +9,13 @@ import shutil
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zmq
+from fixture_types import Start
 from page import Page
 from tactomo.cli.calibrate import reload
 from tactomo.config import load_config
@@ -48,7 +49,6 @@ from tactomo_models.calibration.curve import Reading
 from tactomo_viewer.feed import Feed
 from waiting import PATIENCE_S, wait_until
 
-Start = Callable[..., Any]
 SERVER = "left"
 
 

@@ -105,8 +105,7 @@ def test_who_asks_a_lot_and_reads_the_answers_is_not_cut(daemon: DaemonProcess) 
 
 @pytest.mark.slow
 def test_a_flood_of_subscriptions_is_cut_and_the_stream_goes_on(bench: Callable[..., Any]) -> None:
-    b = bench()
-    b.tare()
+    b = bench().tare()
     flood: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.XSUB)
     with flood:
         flood.setsockopt(zmq.LINGER, 0)

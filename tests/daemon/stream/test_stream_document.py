@@ -48,8 +48,7 @@ NAMED_BY_THEMSELVES = ("stage_ms", "scans")
 @pytest.mark.slow
 def test_every_name_inside_a_status_is_told(bench: Callable[..., Any]) -> None:
     """A message's own fields are held against their tables by `stream_rules`."""
-    daemon = bench(ports=1)
-    daemon.tare()
+    daemon = bench(ports=1).tare()
     daemon.step(load=0.5)
     status = daemon.listener.wait("status", lambda s: s["ports"][0]["device"] and s["reference"])
     assert daemon.listener.of("map")[-1]["map"].keys() == table("### Arrays")

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
+from fixture_types import Start
 from hostile_page import SUBSCRIBE, post
 from tactomo_client.messages import encode_request
-
-Start = Callable[..., Any]
 
 
 def test_a_posted_command_is_not_obeyed(bench: Start) -> None:

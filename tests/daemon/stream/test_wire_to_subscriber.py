@@ -7,19 +7,17 @@ message against the page. `make faults` plays an hour of it (`hostile_board`).
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, cast
 
 import pytest
 from daemon_bench import HELLO, Memory, scan
+from fixture_types import Start
 from hostile_board import EDGES_F64, EDGES_U32, EDGES_U64, content_of, framed
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from stream_rules import Subscriber
 from tactomo_protocol import Channel
-
-Start = Callable[..., Any]
 
 U32 = st.sampled_from(EDGES_U32) | st.integers(0, 2**32 - 1)
 U64 = st.sampled_from(EDGES_U64) | st.integers(0, 2**64 - 1)
@@ -51,8 +49,7 @@ def samples(draw: st.DrawFn) -> bytes:
 
 @pytest.mark.slow
 def test_no_packet_ends_the_publisher_or_breaks_the_stream(bench: Start) -> None:
-    b = bench(real=True, sync_wait_ms=500)
-    b.tare()
+    b = bench(real=True, sync_wait_ms=500).tare()
     line = b.skin.lines[0]
     with Subscriber(b.daemon.stream_address) as subscriber:
 
@@ -77,8 +74,7 @@ def runs(b: Any) -> bool:
 @pytest.mark.parametrize("late_us", [2**53 - 1, 2**62])
 def test_the_largest_clock_goes_through_to_the_subscriber(bench: Start, late_us: int) -> None:
     """Beyond 2^53 the packet breaks PROTOCOL.md; up to it, every value derived of it fits."""
-    b = bench()
-    b.tare()
+    b = bench().tare()
     b.skin.counter += 1
     for channel in Channel:
         content = content_of(scan(channel, b.skin.counter))
@@ -94,8 +90,7 @@ def test_a_message_that_cannot_be_sent_is_left_out_and_told(
     bench: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     proper, no_text = Memory._result, cast("str", 7)
-    b = bench()
-    b.tare()
+    b = bench().tare()
     monkeypatch.setattr(Memory, "_result", lambda *given: replace(proper(*given), reason=no_text))
     b.skin.scan()
     told = b.listener.event("message_unsent")
