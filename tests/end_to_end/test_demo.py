@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import signal
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
+from fixture_types import Run
 from page import first_line_of_the_readme
 from processes import children_of, is_running
 from selenium.webdriver import ActionChains, Chrome
 from selenium.webdriver.common.by import By
 from small_sensor import SMALL
-from tactomo_client import Frame, subscribe
+from tactomo_client import Frame, request, subscribe
 from waiting import PATIENCE_S, wait_until
 from whole_system import SENSOR, Demo, running_demo
 
@@ -98,6 +101,21 @@ def test_the_readme_subscribes_in_six_lines(demo: Demo, tmp_path: Path) -> None:
     line = first_line_of_the_readme(demo, tmp_path)
     demo.clear()
     assert "kPa" in line
+
+
+def test_doctor_finds_a_healthy_skin_and_noise(tactomo: Run, demo: Demo) -> None:
+    def snrs(status: int) -> list[dict[str, Any]]:
+        look = ("doctor", "-s", SENSOR, "--address", demo.stream, "--seconds", "1", "--json")
+        told = json.loads(tactomo(*look, status=status).stdout)
+        assert [each["pressed"] for each in told["stream"] if each["about"] == "frames"] == [0]
+        found = [each for channel in told["channels"].values() for each in channel["findings"]]
+        return [each for each in found if each["about"] == "snr"]
+
+    request("tare", demo.control, PATIENCE_S)
+    assert [each["snr_db"] > 50 for each in snrs(status=0)] == [True, True]
+    request("noise", demo.twin, PATIENCE_S, noise_v=0.02)  # for good: no test after this one
+    request("garbage", demo.twin, PATIENCE_S, count=4000)
+    assert {each["level"] for each in snrs(status=1)} <= {"fault", "broken"}
 
 
 @pytest.mark.slow

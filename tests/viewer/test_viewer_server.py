@@ -14,6 +14,7 @@ import sys
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from importlib import resources
+from pathlib import Path
 from typing import Any, ParamSpec
 
 import aiohttp
@@ -334,8 +335,10 @@ async def test_a_page_that_goes_away_lifts_its_presses_but_not_the_held_ones(
 
 @pytest.mark.slow
 @on_loop
-async def test_the_page_hears_when_the_twin_comes_and_goes(sensor: FakeSensor) -> None:
-    twin = FakeControl()
+async def test_the_page_hears_when_the_twin_comes_and_goes(
+    sensor: FakeSensor, tmp_path: Path
+) -> None:
+    twin = FakeControl(address=f"ipc://{tmp_path}/twin")  # a port may be another's meanwhile
     async with viewer_of(sensor, twin=twin.address) as viewer, viewer.page() as page:
         while not (await page.next("twin"))["answers"]:
             pass  # a busy computer may take longer for the first answer than is waited for

@@ -304,19 +304,3 @@ def test_a_healthy_skin_on_a_busy_computer_is_healthy(demo: Demo) -> None:
     assert (left_out["about"], left_out["level"]) == ("daemon", "advice")
     assert [each for each in found["stream"] if each["level"] == "fault"] == []
     assert (found["verdict"], doctor.returncode) == ("healthy", 0)
-
-
-def test_a_running_daemon(tactomo: Run, demo: Demo) -> None:
-    look = ("doctor", "-s", SENSOR, "--address", demo.stream, "--seconds", "1", "--json")
-    request("tare", demo.control, PATIENCE_S)
-    found = report(tactomo(*look))
-    for channel in found["channels"].values():
-        assert channel["verdict"] == "healthy"
-        assert about(channel["findings"], "snr")["snr_db"] > 50
-    assert about(found["stream"], "frames")["pressed"] == 0
-    request("noise", demo.twin, PATIENCE_S, noise_v=0.02)
-    request("garbage", demo.twin, PATIENCE_S, count=4000)
-    outcome = tactomo(*look, status=1)
-    found = report(outcome)
-    for channel in found["channels"].values():
-        assert about(channel["findings"], "snr")["level"] in ("fault", "broken")

@@ -151,6 +151,7 @@ def test_a_demo_leaves_no_process_behind(start: Run) -> None:
     wait_until(lambda: not any(is_running(child) for child in children))
 
 
+@pytest.mark.slow
 @linux
 def test_a_demo_in_the_background_of_a_script_ends_by_sigint(tmp_path: Path) -> None:
     # A shell has SIGINT ignored for what it starts with `&` where there is no job control.
