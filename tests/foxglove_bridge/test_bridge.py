@@ -18,6 +18,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from foxglove_client import PROTOCOL, FoxgloveClient
+from fuzz_targets import ENVELOPE
 from recorded_grasp import contacts_of, images_of
 from tactomo.cli.children import Family
 from tactomo.imaging.frames import description_fields
@@ -36,18 +37,6 @@ STATUS: Mapping[str, Any] = {
     "issues": [{"severity": "error", "what": "it hums", "next_step": "oil it"}],
     "state": "running",
     "description": DESCRIPTION,
-}
-HEADER: Mapping[str, Any] = {
-    "session": "another",
-    "sequence": 1,
-    "acquired_realtime_ns": None,
-    "acquired_monotonic_ns": None,
-    "device_us": None,
-    "age_ns": None,
-    "tier": None,
-    "tier_reason": None,
-    "flags": [],
-    "misfit": None,
 }
 
 
@@ -211,9 +200,9 @@ def test_numbers_to_plot_and_what_the_daemon_finds_wrong(
     assert 0 <= numbers["age_ms"] < 20_000
     client.wait_said(lambda said: said["op"] == "status" and said["message"] == "it hums: oil it")
     source.also.put(b"left/map\0nonsense")  # what breaks the rules is skipped
-    source.also.put(encode_message("left", "map", {**HEADER, "contacts": "none"}))
+    source.also.put(encode_message("left", "map", {**ENVELOPE, "contacts": "none"}))
     event = {"name": "port_lost", "severity": "error", "detail": "unplugged", "next_step": "plug"}
-    source.also.put(encode_message("left", "event", {**HEADER, **event}))
+    source.also.put(encode_message("left", "event", {**ENVELOPE, **event}))
     line = client.wait("/left/events")
     assert (line.level, line.name, line.file) == (4, "left", "port_lost")
     assert line.message == "port_lost: unplugged -> plug"

@@ -22,12 +22,11 @@ def good() -> Arrays:
     return presses(60, seed=1)
 
 
-def teach(tactomo: Run, folder: Path, arrays: Arrays, *options: str) -> Any:
+def teach(tactomo: Run, folder: Path, arrays: Arrays, *options: str, status: int = 0) -> Any:
     np.savez(folder / "presses.npz", **arrays)
     sensor = write_description(folder / "skin.toml")
-    return tactomo(
-        "teach", "fit", folder / "presses.npz", "--sensor", "palm", "-d", sensor, *options
-    )
+    command = ("teach", "fit", folder / "presses.npz", "--sensor", "palm", "-d", sensor)
+    return tactomo(*command, *options, status=status)
 
 
 def errors_mm(tactomo: Run, folder: Path, *options: Any) -> tuple[np.ndarray, dict[str, Any]]:
@@ -46,7 +45,6 @@ def errors_mm(tactomo: Run, folder: Path, *options: Any) -> tuple[np.ndarray, di
 
 def test_a_taught_skin_is_located_better(tactomo: Run, tmp_path: Path) -> None:
     made = teach(tactomo, tmp_path, presses(30, seed=1))
-    assert made.returncode == 0, made.stderr
     assert "palm: 30 presses of" in made.stdout
     assert f"kept in {taught_path('palm')}" in made.stdout
     shown = tactomo("teach", "show", "--sensor", "palm")
@@ -67,7 +65,6 @@ def test_forces_are_taught_where_they_are_known(tactomo: Run, tmp_path: Path, go
     """Of each second press; a cover makes the physics' a quarter too small."""
     force_n = np.where(np.arange(60) % 2, np.nan, good["force_n"])
     made = teach(tactomo, tmp_path, changed(good, force_n=force_n))
-    assert made.returncode == 0, made.stderr
     assert re.search(r"; forces to \d\.\d%$", made.stdout.splitlines()[0])
     true_n = presses(20, seed=2)["force_n"]
 
@@ -94,7 +91,6 @@ def test_forces_that_say_nothing_are_not_learnt(tactomo: Run, tmp_path: Path, go
         (np.full(60, 9.81), "held-out .* 0% if all were alike"),
     ):
         made = teach(tactomo, tmp_path, changed(good, force_n=force_n))
-        assert made.returncode == 0, made.stderr
         assert re.search(f"forces are not learnt: {why}", made.stderr)
         assert "forces to" not in made.stdout
         assert read_taught(taught_path("palm")).forces is None
@@ -107,7 +103,7 @@ def test_where_nothing_was_taught_the_frame_says_so(
     """Taught on the left half alone."""
     left = good["xy_mm"][:, 0] < 0
     some = {k: v[left] if len(v) == len(left) else v for k, v in good.items()}
-    assert teach(tactomo, tmp_path, some).returncode == 0
+    teach(tactomo, tmp_path, some)
     _, before = errors_mm(tactomo, tmp_path)
     _, maps = errors_mm(tactomo, tmp_path, "--taught", taught_path("palm"))
     far = presses(20, seed=2)["xy_mm"][maps["contact_frame"], 0] > 40
@@ -167,8 +163,7 @@ def first(arrays: Arrays, count: int) -> Arrays:
 def test_bad_presses_are_named_and_not_kept(
     tactomo: Run, tmp_path: Path, good: Arrays, spoil: Callable[[Arrays], Arrays], told: str
 ) -> None:
-    result = teach(tactomo, tmp_path, spoil(good))
-    assert result.returncode == 1, result.stdout
+    result = teach(tactomo, tmp_path, spoil(good), status=1)
     assert told in result.stderr
     assert not taught_path("palm").exists()
 
@@ -179,15 +174,15 @@ def test_presses_that_teach_nothing_are_not_kept(
 ) -> None:
     """A template that is worse than the physics: places good to 5 mm."""
     off = np.random.default_rng(0).normal(0, 5, good["xy_mm"].shape)
-    result = teach(tactomo, tmp_path, changed(good, xy_mm=good["xy_mm"] + off), "--keep-odd")
-    assert result.returncode == 1
+    spoilt = changed(good, xy_mm=good["xy_mm"] + off)
+    result = teach(tactomo, tmp_path, spoilt, "--keep-odd", status=1)
     assert "nothing is kept: of 60 presses" in result.stderr
     assert not taught_path("palm").exists()
 
 
 @pytest.mark.slow
 def test_another_skin_is_refused(tactomo: Run, tmp_path: Path, good: Arrays) -> None:
-    assert teach(tactomo, tmp_path, good).returncode == 0
+    teach(tactomo, tmp_path, good)
     np.savez(tmp_path / "other.npz", **presses(3, seed=3, skin=5))
     result = tactomo(
         *("reconstruct", tmp_path / "other.npz", tmp_path / "maps.npz"),

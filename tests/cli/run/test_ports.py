@@ -8,28 +8,19 @@ import pty
 import threading
 import tty
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from daemon_bench import HELLO
 from fake_machine import FakeMachine
 from fixture_types import Run
 from tactomo.acquisition.identify import identify
 from tactomo.cli.run.ports import lines, question, survey
-from tactomo_protocol import Channel, Command, Decoder, Hello, SampleFormat, encode
+from tactomo_protocol import Channel, Command, Decoder, encode
 from waiting import wait_until
 
-HELLO = Hello(
-    device_id="skin-7f3a",
-    firmware="1.2.3",
-    channels=(Channel.MAGNITUDE,),
-    electrodes=16,
-    drive_offset=1,
-    measure_offset=1,
-    samples_per_scan=208,
-    sample_format=SampleFormat.INT16,
-    volts_per_count=1e-6,
-    scan_rate_hz=20.0,
-)
+SAID = replace(HELLO, device_id="skin-7f3a", channels=(Channel.MAGNITUDE,))
 
 
 @pytest.fixture
@@ -93,7 +84,7 @@ def test_nothing_there_says_what_to_do(tactomo: Run) -> None:
 
 
 def test_a_device_is_asked_who_it_is(tactomo: Run, device: Callable[[bytes], str]) -> None:
-    path = device(encode(HELLO))
+    path = device(encode(SAID))
     result = tactomo("ports", path, "--ask", "--json")
     (port,) = json.loads(result.stdout)["ports"]
     assert port["device"]["device_id"] == "skin-7f3a"

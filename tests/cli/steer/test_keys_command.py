@@ -16,15 +16,15 @@ from tactomo_client.keys import read_public, read_secret
 @pytest.fixture
 def keys(tactomo: Run, tmp_path: Path) -> Run:
     """Run `tactomo keys ARGUMENTS` with a folder of keys of its own."""
-    return lambda *arguments: tactomo("keys", *arguments, "--keys", tmp_path / "keys")
+    own = ("--keys", tmp_path / "keys")
+    return lambda *arguments, **ending: tactomo("keys", *arguments, *own, **ending)
 
 
 def test_what_make_prints_leads_to_a_client_that_is_let_in(
     keys: Run, tactomo: Run, tmp_path: Path
 ) -> None:
     folder = tmp_path / "keys"
-    made = keys("make", "left", "--server")
-    assert made.returncode == 0
+    made = keys("make", "left", "--server", status=0)
     secret = read_secret(folder / "left.key_secret")[1].decode()
     (line,) = [line.strip() for line in made.stdout.splitlines() if "clients = " in line]
     (other,) = [line.strip() for line in made.stdout.splitlines() if "secret = " in line]
@@ -34,8 +34,8 @@ def test_what_make_prints_leads_to_a_client_that_is_let_in(
 
     desk = tactomo("keys", "make", "desk", "--keys", tmp_path / "desk")
     assert "tactomo keys allow desk.key --for SERVER" in desk.stdout
-    allowed = keys("allow", tmp_path / "desk" / "desk.key", "--for", "left", "--may-command")
-    assert allowed.returncode == 0
+    desk_key = tmp_path / "desk" / "desk.key"
+    allowed = keys("allow", desk_key, "--for", "left", "--may-command", status=0)
     (tmp_path / "desk" / "left.key").write_bytes((folder / "left.key").read_bytes())
     loaded = Keys.load(tmp_path / "desk")
     assert loaded.public.decode() in allowed.stdout
@@ -71,11 +71,9 @@ def test_secrets_are_their_owners_and_public_keys_everybodys(keys: Run, tmp_path
 def test_nothing_is_overwritten_without_force(keys: Run, tmp_path: Path) -> None:
     keys("make", "left", "--server")
     first = read_public(tmp_path / "keys" / "left.key")
-    again = keys("make", "left")
-    assert again.returncode == 1
-    assert "--force" in again.stderr
+    assert "--force" in keys("make", "left", status=1).stderr
     assert read_public(tmp_path / "keys" / "left.key") == first
-    assert keys("make", "left", "--force").returncode == 0
+    keys("make", "left", "--force", status=0)
     assert read_public(tmp_path / "keys" / "left.key") != first
 
 
@@ -88,13 +86,11 @@ def test_a_client_is_listed_once_and_taken_off(keys: Run, tactomo: Run, tmp_path
     assert keys("list").stdout.count("desk   ") == 1
     assert "and command" not in keys("list").stdout
     tactomo("keys", "make", "desk", "--keys", public.parent, "--force")
-    assert keys("allow", public, "--for", "left").returncode == 1
-    assert keys("allow", public, "--for", "left", "--force").returncode == 0
-    assert keys("revoke", "desk", "--for", "left").returncode == 0
+    keys("allow", public, "--for", "left", status=1)
+    keys("allow", public, "--for", "left", "--force", status=0)
+    keys("revoke", "desk", "--for", "left", status=0)
     assert "desk   " not in keys("list").stdout
-    gone = keys("revoke", "desk", "--for", "left")
-    assert gone.returncode == 1
-    assert "on it: nobody" in gone.stderr
+    assert "on it: nobody" in keys("revoke", "desk", "--for", "left", status=1).stderr
 
 
 @pytest.mark.parametrize(
@@ -115,10 +111,8 @@ def test_what_cannot_be_done_says_why(
     (tmp_path / "empty.key").touch()
     tactomo("keys", "make", "desk", "--keys", tmp_path)
     keys("make", "arm", "--server")
-    outcome = keys(*arguments)
+    assert said in keys(*arguments, status=1).stderr
     assert not (tmp_path / "keys" / "left.clients").exists()
-    assert outcome.returncode == 1
-    assert said in outcome.stderr
 
 
 def test_a_clients_folder_must_be_unambiguous(keys: Run, tactomo: Run, tmp_path: Path) -> None:
