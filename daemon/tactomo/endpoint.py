@@ -8,6 +8,7 @@ lets in the allowed clients only.
 
 from __future__ import annotations
 
+import ipaddress
 import os
 import resource
 import socket as posix_socket
@@ -20,7 +21,6 @@ from typing import Final
 from urllib.parse import urlsplit
 
 import zmq
-from tactomo_client.connection import is_loopback
 
 from tactomo.errors import AddressError
 
@@ -63,7 +63,11 @@ def check_endpoint(endpoint: str) -> str:
 
 def is_local(endpoint: str) -> bool:
     """Whether an endpoint can be reached from its own computer alone."""
-    return endpoint.startswith(IPC) or is_loopback(urlsplit(endpoint).hostname or "")
+    host = urlsplit(endpoint).hostname or ""
+    try:
+        return endpoint.startswith(IPC) or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def next_address(address: str, steps: int = 1) -> str:

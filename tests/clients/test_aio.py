@@ -154,6 +154,7 @@ def test_commands_of_several_tasks_are_carried_out_one_by_one(run: Run) -> None:
                 )
             assert list(results) == list(answers.values())
             assert [name for name, _ in control.requests] == list(answers)
+            assert await aio.request("tare", control.address, PATIENCE_S) == {"scans": 20}
 
     run(main())
 

@@ -22,18 +22,21 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal, Self, TypeVar, Unpack, cast, overload
 
 import zmq
 import zmq.asyncio
 
 from tactomo_client.connection import Owner, Waiting
-from tactomo_client.control import ControlLine
+from tactomo_client.control import TIMEOUT_S, ControlLine
 from tactomo_client.errors import checked_seconds
+from tactomo_client.keys import Keys
+from tactomo_client.messages import DEFAULT_CONTROL
 from tactomo_client.schema import Event, Frame, Status
 from tactomo_client.subscription import Item, Kind, Options, Reception, T_co
 
-__all__ = ["Control", "Subscription", "subscribe"]
+__all__ = ["Control", "Subscription", "request", "subscribe"]
 
 T = TypeVar("T")
 
@@ -117,6 +120,19 @@ class Subscription(Reception[T_co], AsyncIterator[T_co]):
 
     async def __aexit__(self, *_: object) -> None:
         self.close()
+
+
+async def request(
+    command: str,
+    address: str = DEFAULT_CONTROL,
+    timeout_s: float = TIMEOUT_S,
+    *,
+    keys: Keys | str | Path | None = None,
+    **arguments: Any,
+) -> dict[str, Any]:
+    """Send one command and return its result as it came, as `tactomo_client.request` does."""
+    async with Control(address, keys=keys) as control:
+        return await control.request(command, timeout_s, **arguments)
 
 
 class Control(ControlLine):

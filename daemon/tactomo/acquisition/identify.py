@@ -1,6 +1,7 @@
 """Asking whoever is at a serial port who it is.
 
-The question is a packet of our protocol, in which no other device known here finds a command.
+The question is a packet of our protocol, in which no other device known here finds a command. One
+that sends all the same is known by what it sends; one that waits to be started stays silent.
 """
 
 from __future__ import annotations
@@ -12,10 +13,12 @@ from typing import Final
 from tactomo_protocol import Command, CommandCode, Decoder, Hello, encode
 
 from tactomo.acquisition.connection import Connection
+from tactomo.protocols import recognised
 
 PATIENCE_S: Final = 2.5
 """A device says hello every second, and within one of the reset that opening a port may cause."""
 ASK_AGAIN_S: Final = 0.5
+_REMEMBERED: Final = 65_536  # bytes; several frames of any protocol
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,23 +41,26 @@ def identify(path: str, baud: int, patience_s: float = PATIENCE_S) -> Answer:
 
 
 def _converse(connection: Connection, baud: int, patience_s: float) -> Answer:
-    decoder, has_heard = Decoder(), False
+    decoder, received = Decoder(), b""
     end_s, ask_s = time.monotonic() + patience_s, 0.0
     while connection.is_open and (now_s := time.monotonic()) < end_s:
         if now_s >= ask_s:
             connection.write(encode(Command(CommandCode.IDENTIFY, 1)))
             ask_s = now_s + ASK_AGAIN_S
         data = connection.read()
-        has_heard = has_heard or bool(data)
+        received = (received + data)[-_REMEMBERED:]
         for packet in decoder.feed(data):
             if isinstance(packet, Hello):
                 return Answer(packet)
-    return Answer(None, connection.problem or _silence(has_heard, decoder.counts.packets, baud))
+    return Answer(None, connection.problem or _silence(received, decoder.counts.packets, baud))
 
 
-def _silence(has_heard: bool, packets: int, baud: int) -> str:
+def _silence(received: bytes, packets: int, baud: int) -> str:
     if packets:
         return "the device sends packets, but no hello"
-    if has_heard:
-        return f"bytes and no packet at {baud} baud: another --protocol or baud rate, or no skin"
+    protocol = recognised(received)
+    if protocol is not None:
+        return f"no hello, but what it sends looks like --protocol {protocol}"
+    if received:
+        return f"bytes and no packet at {baud} baud: no skin, or another baud rate"
     return "no answer; a device of another --protocol may wait for a start command"

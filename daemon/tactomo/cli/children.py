@@ -38,8 +38,11 @@ class ChildError(TactomoError):
 class Child:
     """One running `tactomo` command."""
 
-    def __init__(self, name: str, arguments: list[str], ended: queue.SimpleQueue[Child]) -> None:
+    def __init__(
+        self, name: str, arguments: list[str], ended: queue.SimpleQueue[Child], verbose: bool
+    ) -> None:
         self.name = name
+        self._verbose = verbose
         self._lines: collections.deque[str] = collections.deque(maxlen=KEPT_LINES)
         self._ready: Mapping[str, Any] | None = None
         self._changed = threading.Event()
@@ -121,7 +124,7 @@ class Child:
         for line in self._process.stdout:
             ready = _announcement(line)
             if ready is None:
-                self._lines.append(_readable(line))
+                self._keep_line(_readable(line))
             else:
                 self._ready = ready
                 self._changed.set()
@@ -129,17 +132,23 @@ class Child:
         self._changed.set()
         self._ended.put(self)
 
+    def _keep_line(self, line: str) -> None:
+        self._lines.append(line)
+        if self._verbose:
+            print(f"{self.name}: {line}", file=sys.stderr, flush=True)
+
 
 class Family:
     """Children that are stopped together when the block ends, however it ends."""
 
-    def __init__(self) -> None:
+    def __init__(self, verbose: bool = False) -> None:
+        self._verbose = verbose
         self._children: list[Child] = []
         self._ended: queue.SimpleQueue[Child] = queue.SimpleQueue()
 
     def start(self, name: str, *arguments: str) -> Child:
         """Start one child."""
-        self._children.append(Child(name, list(arguments), self._ended))
+        self._children.append(Child(name, list(arguments), self._ended, self._verbose))
         return self._children[-1]
 
     def wait_for_an_end(self) -> Child:
@@ -173,10 +182,10 @@ class no_interruption:  # noqa: N801 - reads as a statement
             signal.signal(number, handler)
 
 
-def new_family() -> Family:
+def new_family(verbose: bool = False) -> Family:
     """Return a new family, which any signal to end ends as Ctrl-C does."""
     interrupt_at_end()
-    return Family()
+    return Family(verbose)
 
 
 def interrupt_at_end() -> None:

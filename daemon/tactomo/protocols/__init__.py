@@ -18,6 +18,7 @@ from tactomo.protocols.registry import (
     emulator_of,
     find_protocol,
     protocol_named,
+    recognised,
 )
 
 __all__ = [
@@ -32,4 +33,5 @@ __all__ = [
     "emulator_of",
     "find_protocol",
     "protocol_named",
+    "recognised",
 ]

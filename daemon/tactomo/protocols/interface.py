@@ -102,6 +102,11 @@ class PortProtocol:
     def __init__(self, description: SensorDescription | None) -> None:
         """Raise ConfigError where the protocol cannot carry the sensor."""
 
+    @classmethod
+    def recognises(cls, data: bytes) -> bool:
+        """Tell whether these bytes, from anywhere in a stream, are likely of this protocol."""
+        return False
+
     def feed(self, data: bytes) -> list[Packet]:
         """Return the packets completed by `data`; any bytes in any chunking, never raises."""
         raise NotImplementedError

@@ -20,6 +20,7 @@ trailing comma, zeros where pairs share an electrode; the ESP32 of richgumy/blac
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Final
 
 import numpy as np
@@ -32,6 +33,7 @@ from tactomo.protocols.lines import LineProtocol, electrodes_of, numbers
 
 BEGINNINGS: Final = (b"", b"A")
 ANOTHER_BOARD: Final = "give the description of the board that is connected"
+FEWEST_IN_ROW: Final = 8  # numbers in a line of a table, or of a row of it, at least
 
 
 class Matrix(LineProtocol):
@@ -117,3 +119,13 @@ class Matrix(LineProtocol):
         if count == self._width:
             described = "and no line, empty or of an A, that says where a frame begins"
         self.misfit(f"{count} numbers a line{electrodes_of(count)}; {described}", ANOTHER_BOARD)
+
+    @classmethod
+    def recognises(cls, data: bytes) -> bool:
+        """See `ForeignProtocol`: two whole lines of as many numbers."""
+        found = Counter(
+            len(values)
+            for line in data.split(b"\n")[1:-1]
+            if (values := numbers(line)) is not None and len(values) >= FEWEST_IN_ROW
+        )
+        return any(lines > 1 for lines in found.values())

@@ -76,6 +76,11 @@ class NativeProtocol(PortProtocol):
         readings = (encode(each) for kept in self._readings.values() for each in kept)
         return encode(self._hello) + b"".join(readings) + self._tail
 
+    @classmethod
+    def recognises(cls, data: bytes) -> bool:
+        """Tell whether there is a whole packet in the bytes."""
+        return bool(Decoder().feed(data))
+
     def _commands(self, *codes: CommandCode) -> list[bytes]:
         commands = []
         for code in codes:

@@ -27,7 +27,7 @@ from tactomo.protocols.interface import PortProtocol
 GROUP: Final = "tactomo.protocols"
 NATIVE: Final = "tactomo"  # the protocol of `firmware_protocol/PROTOCOL.md`
 WHERE: Final = "run in its folder, or set PYTHONPATH"
-_MEMBERS: Final = ("name", "baud", "feed", "introduction", "preamble")
+_MEMBERS: Final = ("name", "baud", "recognises", "feed", "introduction", "preamble")
 
 _named: dict[str, type[PortProtocol]] = {}  # by `name`: classes that the user named at the start
 
@@ -87,6 +87,17 @@ def emulator_of(name: str) -> Callable[[SensorDescription, float], Any]:
         )
     made: Callable[[SensorDescription, float], Any] = _load(path)
     return made
+
+
+def recognised(data: bytes) -> str | None:
+    """Return the protocol that these bytes are of; None where they are of none."""
+    for name in available_protocols():
+        try:
+            if _registered(name).recognises(data):
+                return name
+        except Exception:  # an installed protocol that is broken says nothing of other ones
+            continue
+    return None
 
 
 def _registered(name: str) -> type[PortProtocol]:

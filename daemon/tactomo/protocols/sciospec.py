@@ -77,6 +77,9 @@ _TIME: Final = slice(7, 11)
 
 _CODES: Final = b"\x01\x02\x04\x11\x81\x82\x83\x84\x92"
 _START: Final = re.compile(rb"\xb4\x89|\x18\x01|\xb4$|\x18$")
+_ANY: Final = re.compile(
+    rb"\x18\x01[" + re.escape(_CODES) + rb"]\x18|\xb4\x89.{137}\xb4", re.DOTALL
+)
 _FLOAT_FROM: Final = 0x3A80_0000  # floats above a thousandth; 11 days, read as milliseconds
 _GAP: Final = 8.0
 """Times the usual one between messages, above which they are of two frames; it is a frame's 16."""
@@ -185,6 +188,11 @@ class Sciospec(ForeignProtocol):
     def begun(self) -> bytes:
         """Return the messages of the frame that has begun, and the beginning of the next one."""
         return b"".join(self._parts.values()) + self._buffer
+
+    @classmethod
+    def recognises(cls, data: bytes) -> bool:
+        """Tell whether there is a whole message in it."""
+        return _ANY.search(data) is not None
 
     def parse(self, data: bytes) -> Iterator[Reading]:
         """Yield the frames that are complete."""

@@ -117,4 +117,4 @@ def test_who_does_not_say_hello_is_no_skin(
 
 def test_a_port_that_cannot_be_opened_says_why(tmp_path: Path) -> None:
     path = str(tmp_path / "nowhere")
-    assert "does not exist" in question([path])[path].problem
+    assert "does not exist" in question([path], 921_600)[path].problem

@@ -87,6 +87,7 @@ def test_the_twins_defaults_are_those_of_its_configuration() -> None:
     options = {option.name: option.default for option in twin_command().params}
     usual = TwinConfig(load_description("paper_square"))
     assert options["rate"] == usual.rate_hz
+    assert (options["unevenness"], options["seed"]) == (usual.unevenness, usual.seed)
     assert options["twin_control"] == usual.control
 
 
@@ -223,3 +224,10 @@ def test_a_child_that_is_ready_ends_with_a_parent_that_is_killed() -> None:
         assert is_running(child)
         parent.kill()
     wait_until(lambda: not is_running(child))
+
+
+@pytest.mark.slow
+def test_a_verbose_family_passes_on_what_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    with Family(verbose=True) as family:
+        family.start("list", "models", "list").wait_done()
+    assert "list: paper_square" in capsys.readouterr().err

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tactomo.errors import ConfigError
-from tactomo.protocols import ForeignProtocol, protocol_named
+from tactomo.protocols import ForeignProtocol, protocol_named, recognised
 from tactomo.protocols.lines import MAX_LINE_BYTES
 from tactomo.protocols.matrix import Matrix
 from tactomo_models import SensorDescription, load_description
@@ -236,6 +236,14 @@ def test_a_new_cable_does_not_finish_the_old_line() -> None:
     assert isinstance(scan, Scan)
     assert scan.counter == 1
     assert protocol.counts.corrupt == 0
+
+
+def test_ports_are_recognised_by_what_they_print() -> None:
+    assert recognised(openeit_line(VALUES[:192])[300:] + openeit_line(VALUES[:192]) * 2) == "matrix"
+    assert recognised(teensy_line(np.ones(256)) * 4) == "matrix"
+    assert recognised(b"x" + teensy_line(np.ones(16)) * 4) == "matrix"
+    assert recognised(b"temperature 1\ntemperature 2\n") is None
+    assert recognised(bytes(range(256)) * 8) is None
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from tactomo.protocols import (
     Reading,
     find_protocol,
     protocol_named,
+    recognised,
     registry,
 )
 from tactomo.recordings.recording import Origin, open_recording
@@ -25,6 +26,7 @@ from tactomo.twin import TwinConfig
 from tactomo_client import ControlError, request
 from tactomo_models import load_description
 from tactomo_protocol import CompanionReading, Scan, ScanFlag
+from typer.testing import CliRunner
 from variants import variant
 from waiting import repeated, wait_until
 
@@ -143,6 +145,17 @@ def test_a_mistake_in_a_protocol_costs_no_port(folder: Path) -> None:
 def test_the_twin_says_what_it_needs_to_speak_it(folder: Path) -> None:
     with pytest.raises(ConfigError, match=r"does not speak the protocol 'mute'.*emulator ="):
         TwinConfig(SENSOR, protocol="own_board:Mute")
+
+
+@pytest.mark.slow
+def test_ports_knows_it_by_what_it_sends(folder: Path, board: str) -> None:
+    from tactomo.cli import app
+
+    assert recognised(b"..EIT\n..") is None
+    result = CliRunner().invoke(
+        app, ["ports", board, "--ask", "--protocol", "own_board:FloatBoard"]
+    )
+    assert "--protocol float-board" in " ".join(result.output.split())
 
 
 class WithCell(ForeignProtocol):

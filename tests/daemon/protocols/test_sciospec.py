@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sciospec_stream import frames, started, used
 from tactomo.errors import ConfigError
-from tactomo.protocols import protocol_named
+from tactomo.protocols import protocol_named, recognised
 from tactomo.protocols.sciospec import DATA, Sciospec, requests
 from tactomo_models import SensorDescription, load_description
 from tactomo_protocol import Channel, Hello, Packet, Scan
@@ -273,3 +273,9 @@ def test_what_the_instrument_cannot_do_is_refused_at_once(tmp_path: Path) -> Non
         protocol_named("sciospec", load_description("paper_square"))
     with pytest.raises(ConfigError, match=r"injects 1e-07 to 0\.01 A"):
         protocol_named("sciospec", sensor(tmp_path, current_a="current_a = 0.1"))
+
+
+def test_it_is_recognised_from_anywhere() -> None:
+    assert recognised(stream(MESSAGES)[77:]) == "sciospec"
+    assert recognised(b"\0\0" + ACK) == "sciospec"
+    assert recognised(b"magnitudes: 1, 2, 3\r\n" * 30) != "sciospec"

@@ -61,6 +61,9 @@ def live(
     sensor: options.Sensor = None,
     diameter_mm: DiameterMm = None,
     area_mm2: AreaMm2 = None,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Begin anew, without earlier readings.")
+    ] = False,
     output: options.KeptFile = None,
     address: options.Address = None,
     keys: options.KeysFolder = None,
@@ -81,7 +84,7 @@ def live(
     status = to_status(newest_status(found.sensor, address, keys))
     path = output or calibration_path(found.sensor)
     area = _area_mm2(diameter_mm, area_mm2)
-    made = guided(status, found.stream, keys, area, path)
+    made = guided(status, found.stream, keys, area, path, fresh=fresh)
     print_calibration(made)
     keep(made, path, address, keys)
 

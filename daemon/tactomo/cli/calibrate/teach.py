@@ -43,10 +43,16 @@ KeepOdd = Annotated[
 
 
 @app.command(
-    epilog=options.examples("tactomo teach live", "tactomo teach live --sensor left_forearm")
+    epilog=options.examples(
+        "tactomo teach live", "tactomo teach live --sensor left_forearm --presses palm.npz"
+    )
 )
 def live(
     sensor: options.Sensor = None,
+    presses: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.npz", help="File for the presses. [beside the taught model]"),
+    ] = None,
     description: options.GivenDescription = None,
     output: options.KeptFile = None,
     keep_odd: KeepOdd = False,
@@ -64,7 +70,7 @@ def live(
 
     found = find_sensor(sensor, address, keys)
     path = output or taught_path(found.sensor)
-    file = path.with_name(f"{found.sensor}.presses.npz")
+    file = presses or path.with_name(f"{found.sensor}.presses.npz")
     sensor_description, subject = guided(found.sensor, found.stream, keys, description, file)
     _teach(file, sensor_description, subject, path, address, keys, keep_odd=keep_odd)
 

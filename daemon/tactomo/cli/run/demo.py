@@ -33,7 +33,7 @@ app = options.typer_app()
     epilog=options.examples(
         "tactomo demo",
         "tactomo demo --scene two_fingers_merge",
-        "tactomo demo --ports 1",
+        "tactomo demo --ports 1 --noise-uv 50",
         "tactomo demo --description graded_square",
     )
 )
@@ -45,6 +45,9 @@ def demo(
     rate: options.Rate = 20.0,
     scene: Annotated[
         Path | None, typer.Option(help="A scripted scene, shipped or TOML, that presses by itself.")
+    ] = None,
+    noise_uv: Annotated[
+        float | None, typer.Option(min=0.0, help="Converter noise, µV rms.")
     ] = None,
     record: Annotated[
         Path | None, typer.Option(help="Record the ports' bytes to this file.")
@@ -61,6 +64,9 @@ def demo(
     ] = None,
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Do not open the page, where there is a desktop.")
+    ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Show the logs of the three programs.")
     ] = False,
     announce: options.Announce = False,
 ) -> None:
@@ -84,6 +90,7 @@ def demo(
         *("--description", description, "--rate", str(rate), "--twin-control", twin_control),
         *_optional("--ports", ports),
         *_optional("--scene", scene),
+        *_optional("--noise-uv", noise_uv),
     ]
     daemon_options = [
         *("--sensor", sensor, "--description", description),
@@ -94,7 +101,7 @@ def demo(
     ]
     with (
         tempfile.TemporaryDirectory(prefix="tactomo-") as folder,
-        new_family() as family,
+        new_family(verbose) as family,
     ):
         # On a first start the daemon's models take as long to build as the twin's: do both at once.
         builder = family.start("models build", "models", "build", "--description", description)

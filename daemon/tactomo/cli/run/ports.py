@@ -44,6 +44,13 @@ def ports(
             "few bytes, and resets some boards.",
         ),
     ] = False,
+    protocol: Annotated[
+        str | None,
+        typer.Option(metavar="my_module:MyProtocol", help="A protocol of your own to recognise."),
+    ] = None,
+    baud: Annotated[
+        int | None, typer.Option(min=1200, help="Baud rate; USB takes any. [the protocol's usual]")
+    ] = None,
     as_json: JsonOutput = False,
 ) -> None:
     """List serial adapters with their permanent names, the processes that use them, and problems.
@@ -53,7 +60,7 @@ def ports(
     """
     found = survey(paths or [])
     asked = [row.path for row in found if paths or (row.adapter and row.adapter.is_usb)]
-    answers = question(asked) if ask else {}
+    answers = question(asked, baud, protocol) if ask else {}
     if as_json:
         print_json({"ports": [as_fields(row, answers) for row in found]})
         return
@@ -87,16 +94,20 @@ def survey(paths: Sequence[str], root: Path = Path("/")) -> list[Row]:
     ]
 
 
-def question(paths: Sequence[str]) -> dict[str, Answer]:
+def question(
+    paths: Sequence[str], baud: int | None, protocol: str | None = None
+) -> dict[str, Answer]:
     """Ask all ports at the same time who is there."""
     from concurrent.futures import ThreadPoolExecutor
 
     from tactomo.acquisition.identify import identify
     from tactomo.protocols import NATIVE, find_protocol
 
-    baud = find_protocol(NATIVE).baud
+    usual = find_protocol(protocol or NATIVE).baud
     with ThreadPoolExecutor(max_workers=max(1, len(paths))) as pool:
-        return dict(zip(paths, pool.map(lambda path: identify(path, baud), paths), strict=True))
+        return dict(
+            zip(paths, pool.map(lambda path: identify(path, baud or usual), paths), strict=True)
+        )
 
 
 def as_fields(row: Row, answers: dict[str, Answer]) -> dict[str, Any]:

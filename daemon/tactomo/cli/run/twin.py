@@ -33,6 +33,15 @@ def twin(
         Path | None,
         typer.Option(help="Folder for links with stable names: magnitude and structure, or skin."),
     ] = None,
+    noise_uv: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="Converter noise, µV rms. [60 dB below the signal]"),
+    ] = None,
+    unevenness: Annotated[
+        float,
+        typer.Option(min=0.0, max=0.5, help="Unevenness of the sheet's conductivity; 0.05 is 5 %."),
+    ] = 0.03,
+    seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal noise and drift.")] = 0,
     twin_control: Annotated[
         str, typer.Option("--twin-control", help="Address for `tactomo poke`.")
     ] = options.DEFAULT_TWIN_CONTROL,
@@ -57,6 +66,9 @@ def twin(
         sensor,
         ports=lines if ports is None else ports,
         rate_hz=rate,
+        noise_v=None if noise_uv is None else noise_uv * 1e-6,
+        unevenness=unevenness,
+        seed=seed,
         scene=None if scene is None else load_scene(scene),
         protocol=protocol,
         control=twin_control,

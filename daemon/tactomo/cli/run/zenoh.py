@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import socket
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from tactomo.cli.options import KeysFolder, examples, typer_app
 from tactomo.errors import needs
+
+LogLevel = Literal["debug", "info", "warning", "error"]
+LogFormat = Literal["auto", "text", "json", "journal"]
 
 app = typer_app()
 
@@ -44,6 +47,15 @@ def zenoh(
         ),
     ] = None,
     keys: KeysFolder = None,
+    log_level: Annotated[
+        LogLevel, typer.Option(help="Lowest severity of logged messages.")
+    ] = "info",
+    log_format: Annotated[
+        LogFormat,
+        typer.Option(
+            help="text, json, journal; auto: text on a terminal, journal for journald, else json."
+        ),
+    ] = "auto",
 ) -> None:
     """Carry streams beyond this computer by Eclipse Zenoh, until stopped.
 
@@ -63,7 +75,7 @@ def zenoh(
     from tactomo.log import configure_logging
     from tactomo.stream.relay import serve
 
-    configure_logging()
+    configure_logging(log_level, log_format)
     if bind:
         serve(ZenohProxy(_checked(robot) if robot else "*", _endpoint(bind), config))
     else:
