@@ -71,10 +71,22 @@ class Life(NamedTuple):
     """Counter of the first frame against the second reference."""
 
 
+LIVES: dict[int, Life] = {}
+"""By the number of ports; each is recorded once."""
+
+
 @pytest.fixture(params=[pytest.param(1, marks=pytest.mark.slow), 2])
-def life(request: pytest.FixtureRequest, bench: Start, tmp_path: Path) -> Life:
-    path = tmp_path / "life.mcap"
-    b = bench(ports=request.param).tare()
+def life(
+    request: pytest.FixtureRequest, bench: Start, tmp_path_factory: pytest.TempPathFactory
+) -> Life:
+    if request.param not in LIVES:
+        folder = tmp_path_factory.mktemp("life")
+        b = bench(ports=request.param, recording={"folder": folder}).tare()
+        LIVES[request.param] = recorded(b, folder / "life.mcap")
+    return LIVES[request.param]
+
+
+def recorded(b: Bench, path: Path) -> Life:
     b.ask("record_start", path=path.name)
     first = b.skin.counter + 1
     for index in range(8):
