@@ -159,19 +159,42 @@ int find_areas(const Sheet *s, int64_t count, const int64_t *where, Areas *a) {
   return done != n ? UNSOLVABLE : 0;
 }
 
-/* Conductivity of a triangle as its corners have it, and whether none is worse than at rest.
+static const double LEAST = 0.01, ROUNDING = 1e-12; /* of a conductivity ratio; of a change */
+
+/* Conductivity of a triangle, and its slopes by that of each corner: at rest its own, else by the
+ * power mean of what its corners grew by; see `ForwardModel.solve`.
  *
- * change: (pressable,); NULL at rest.
+ * change: (pressable,); NULL at rest. Not above 0 where a corner's is not.
  */
-static int at_corners(const Sheet *s, int64_t t, const double *change, double sigma[3]) {
-  int better = 1;
-  for (int c = 0; c < 3; c++) {
-    int64_t p = s->corner_pressable[3 * t + c];
-    double by = p < 0 || !change ? 0.0 : change[p];
-    sigma[c] = s->conductivity[t] + by;
-    better &= sigma[c] >= s->conductivity[t];
+static double conductivity_of(const Sheet *s, int64_t t, double exponent, const double *change,
+                              double by[3]) {
+  double rest = s->conductivity[t], at_rest[3], grown[3], power[3];
+  int better = 1, whole = 1;
+  for (int k = 0; k < 3; k++) {
+    int64_t p = s->corner_pressable[3 * t + k];
+    double more = p < 0 || !change ? 0.0 : change[p];
+    at_rest[k] = p < 0 ? rest : s->at_rest[p], grown[k] = (at_rest[k] + more) / at_rest[k];
+    better &= more >= -ROUNDING * at_rest[k], whole &= grown[k] > 0;
   }
-  return better;
+  if (exponent == 1) { /* the sheet's own law: linear in what its nodes conduct */
+    double sigma = rest;
+    for (int k = 0; k < 3; k++) sigma += (grown[k] - 1) * at_rest[k] / 3, by[k] = 1.0 / 3;
+    return sigma;
+  }
+  if (!whole) return by[0] = by[1] = by[2] = 0.0;
+  double p = better ? exponent : fabs(exponent), mean = 0.0, sigma = grown[0];
+  if (grown[0] == grown[1] && grown[0] == grown[2]) { /* within a contact, and beside it */
+    for (int k = 0; k < 3; k++) by[k] = rest / at_rest[k] / 3;
+    return rest * sigma;
+  }
+  for (int k = 0; k < 3; k++) {
+    power[k] = p == 0 ? log(grown[k]) : pow(grown[k], p);
+    mean += power[k] / 3;
+  }
+  sigma = p == 0 ? exp(mean) : pow(mean, 1 / p);
+  for (int k = 0; k < 3; k++) /* power[k] / mean: how much of the mean is that corner's */
+    by[k] = rest * sigma / (3 * grown[k] * at_rest[k]) * (p == 0 ? 1.0 : power[k] / mean);
+  return rest * sigma;
 }
 
 static int size_of(const Areas *a, int64_t layer) { return a->start[layer + 1] - a->start[layer]; }
@@ -191,17 +214,12 @@ typedef struct {
 static void forget(Condensed *c) { free(c->offset), free(c->flat); }
 
 /* Sum triangles into layers: see `Condensed.flat`. */
-static void assemble(const Sheet *s, const Areas *a, int mixes, const double *change,
+static void assemble(const Sheet *s, const Areas *a, double exponent, const double *change,
                      Condensed *c) {
   for (int64_t i = 0; i < a->triangles; i++) {
     int64_t t = a->triangle[i];
     const int64_t *corner = a->corner + 3 * i;
-    double each[3], sigma;
-    int better = at_corners(s, t, change, each);
-    if (mixes && better)
-      sigma = 3 / (1 / each[0] + 1 / each[1] + 1 / each[2]);
-    else
-      sigma = (each[0] + each[1] + each[2]) / 3;
+    double by[3], sigma = conductivity_of(s, t, exponent, change, by);
     for (int m = 0; m < 3; m++)
       for (int n = 0; n < 3; n++) {
         int64_t row = a->layer[corner[m]], col = a->layer[corner[n]];
@@ -214,7 +232,7 @@ static void assemble(const Sheet *s, const Areas *a, int mixes, const double *ch
 }
 
 /* Condense areas, layer by layer outwards. */
-static int condense(const Sheet *s, const Areas *a, int mixes, const double *change,
+static int condense(const Sheet *s, const Areas *a, double exponent, const double *change,
                     Condensed *c) {
   int64_t total = 0;
   c->offset = malloc(sizeof(int64_t) * (a->layers + 1));
@@ -225,7 +243,7 @@ static int condense(const Sheet *s, const Areas *a, int mixes, const double *cha
     forget(c);
     return -1;
   }
-  assemble(s, a, mixes, change, c);
+  assemble(s, a, exponent, change, c);
   for (int64_t l = a->layers - 1; l >= 0; l--) {
     int size = size_of(a, l), outer = outer_of(a, l), failed = 0;
     if (!outer) continue;
@@ -326,11 +344,11 @@ static int factor(const Sheet *s, const Areas *a, const Condensed *c, Rims *rims
 
 /* What is pressed on a sheet, and what becomes of it. */
 typedef struct {
-  int64_t count, mixes_resistivities;
+  int64_t count;
   const int64_t *where;    /* (count,) pressable nodes */
   const double *share;     /* (count,) pressed; NULL where `change` is given */
   const double *pressure;  /* (count,) kPa */
-  double log_ratio;
+  double log_ratio, exponent;
   double *change;     /* (pressable,) conductivity minus the bare sheet's */
   double *voltages;   /* (voltages,) */
   double *residual;   /* (voltages,) weighted */
@@ -391,7 +409,7 @@ static int solve(const Sheet *s, const Areas *a, const Pressing *p) {
   int F = s->fields, r = a->rim, width = r + F;
   Condensed c;
   Rims rims = {NULL, NULL};
-  int failed = condense(s, a, p->mixes_resistivities, p->change, &c);
+  int failed = condense(s, a, p->exponent, p->change, &c);
   if (failed) return failed;
   double *moved = malloc(sizeof(double) * F * F);
   failed = moved ? factor(s, a, &c, &rims) : -1;
@@ -411,9 +429,8 @@ typedef struct {
   int64_t saturates, count;
   const double *pressure; /* (count,) kPa */
   const double *value;    /* (count,) relative change, or share of the full change's logarithm */
+  double reflection;      /* what the outline of a typical contact reflects, from 0 to 1 */
 } Response;
-
-static const double LEAST = 0.01, ROUNDING = 1e-12;
 
 /* A table's value and slope; beyond its end either its last piece or its last value goes on. */
 static double of_table(const Response *r, double pressure, double *slope) {
@@ -425,28 +442,40 @@ static double of_table(const Response *r, double pressure, double *slope) {
   return value[i] + *slope * (pressure - at[i]);
 }
 
-/* Conductivity ratio of a node, and its derivatives by share, pressure and log ratio. */
+/* Conductivity ratio of a node of which a share changes to the exponential of `log_full`, and its
+ * slopes by both: the power mean whose exponent is what the outline reflects. */
+static double blended(double reflection, double share, double log_full, double by[2]) {
+  double k = -copysign(reflection, log_full);
+  if (reflection < 1e-6) { /* its limit, the mean of logarithms */
+    double sigma = exp(share * log_full);
+    by[0] = sigma * log_full, by[1] = sigma * share;
+    return sigma;
+  }
+  double power = exp(k * log_full); /* a small contact's share may be drawn above 1 */
+  double least = k > 0 ? fmin(power, pow(LEAST, k)) : 1e-9, wanted = 1 + share * (power - 1);
+  double mixed = fmax(wanted, least);
+  double sigma = pow(mixed, 1 / k), slope = wanted < least * (1 - ROUNDING) ? 0.0 : sigma / mixed;
+  by[0] = slope * (power - 1) / k, by[1] = slope * share * power;
+  return sigma;
+}
+
+/* The same with slopes by share, pressure and log ratio. */
 static double graded(const Response *r, double share, double pressure, double by[3]) {
-  double slope, change = of_table(r, pressure, &slope);
+  double slope, change = of_table(r, pressure, &slope), own[2];
   if (fabs(change) < ROUNDING) change = 0.0;
   if (change <= LEAST - 1) change = LEAST - 1, slope = 0.0;
-  double sigma = 1 + share * change;
-  int there = sigma > LEAST; /* a small contact's share may be drawn above 1 */
-  by[0] = there ? change : 0.0, by[1] = there ? share * slope : 0.0, by[2] = 0.0;
-  return there ? sigma : LEAST;
+  double sigma = blended(r->reflection, share, log(1 + change), own);
+  by[0] = own[0], by[1] = own[1] * slope / (1 + change), by[2] = 0.0;
+  return sigma;
 }
 
 static double saturating(const Response *r, double share, double pressure, double log_ratio,
                          double by[3]) {
-  double slope = 0.0, saturation = r->count ? of_table(r, pressure, &slope) : 1.0;
-  double turned = share < 0 ? -1.0 : 1.0, log_full = turned * log_ratio * saturation;
-  double least = exp(-fabs(log_full)), mixed = 1 - fabs(share) * (1 - least);
-  int better = log_full > 0;
-  double sigma = better ? 1 / mixed : mixed, by_mixed = better ? -sigma * sigma : 1.0;
-  double by_log_full = by_mixed * fabs(share) * least * (better ? -1.0 : 1.0);
-  by[0] = by_mixed * (least - 1) * turned;
-  by[1] = by_log_full * turned * log_ratio * slope;
-  by[2] = by_log_full * turned * saturation;
+  double slope = 0.0, saturation = r->count ? of_table(r, pressure, &slope) : 1.0, own[2];
+  double turned = share < 0 ? -1.0 : 1.0;
+  double sigma = blended(r->reflection, fabs(share), turned * log_ratio * saturation, own);
+  by[0] = turned * own[0];
+  by[1] = own[1] * turned * log_ratio * slope, by[2] = own[1] * turned * saturation;
   return sigma;
 }
 
@@ -540,22 +569,19 @@ static int find_active(const Sheet *s, const Areas *a, int64_t begin, int strip,
  *
  * Out: weight (strip, K). slot: (count,) scratch that is -1 and left so.
  */
-static void weigh(const Sheet *s, const Areas *a, int64_t begin, int strip, const double *mixed,
-                  const int64_t *place, int64_t count, const double *onto, int K,
+static void weigh(const Sheet *s, const Areas *a, int64_t begin, int strip, double exponent,
+                  const double *change, const int64_t *place, int64_t count, const double *onto, int K,
                   const int64_t *active, int64_t *slot, double *weight) {
   for (int k = 0; k < K; k++) slot[active[k]] = k;
   memset(weight, 0, sizeof(double) * strip * K);
   for (int i = 0; i < strip; i++) {
     int64_t t = a->triangle[begin + i];
-    double share[3] = {1.0, 1.0, 1.0}, c[3], *into = weight + i * K;
-    if (mixed && at_corners(s, t, mixed, c)) { /* d sigma / d sigma_c = (sigma / sigma_c)^2 / 3 */
-      double mean = (1 / c[0] + 1 / c[1] + 1 / c[2]) / 3;
-      for (int k = 0; k < 3; k++) share[k] = 1 / (c[k] * c[k] * mean * mean);
-    }
+    double share[3], *into = weight + i * K;
+    conductivity_of(s, t, exponent, change, share);
     for (int k = 0; k < 3; k++) {
       int64_t p = s->corner_pressable[3 * t + k];
       if (p < 0 || place[p] < 0) continue;
-      double by = -share[k] * s->area[t] / 3; /* minus the area that goes with the corner */
+      double by = -share[k] * s->area[t]; /* minus the area that goes with the corner */
       if (!onto) into[slot[place[p]]] += by;
       for (int j = 0; onto && j < K; j++) into[j] += by * onto[place[p] * count + active[j]];
     }
@@ -587,14 +613,15 @@ static void field_products(const Sheet *s, const Areas *a, int64_t begin, int st
 
 /* Derivative of the voltages by parameters; see `ForwardModel.jacobian`.
  *
- * where: (nodes,) pressable nodes that the areas are around. potentials: (n, fields). mixed:
- * (pressable,) changes whose resistivities were mixed, or NULL. onto: (nodes, count) derivatives of
+ * where: (nodes,) pressable nodes that the areas are around. potentials: (n, fields).
+ * exponent, change: of the triangles' power mean, and what was solved for (pressable,). onto:
+ * (nodes, count) derivatives of
  * these nodes' conductivities by the parameters; NULL where they are the parameters themselves.
  * scale: (voltages,). Out: (voltages, count).
  */
 int differentiate(const Sheet *s, const Areas *a, int64_t nodes, const int64_t *where,
-                  const double *potentials, const double *mixed, int64_t count, const double *onto,
-                  const double *scale, double *jacobian) {
+                  const double *potentials, double exponent, const double *change, int64_t count,
+                  const double *onto, const double *scale, double *jacobian) {
   int P = s->pairs, Q = s->products, F = s->fields;
   int64_t most = onto || count < 3 * STRIP ? count : 3 * STRIP; /* that move a strip */
   size_t reals = a->nodes * P + STRIP * (2 * P + Q + most) + Q * (most + count) + 1;
@@ -622,7 +649,7 @@ int differentiate(const Sheet *s, const Areas *a, int64_t nodes, const int64_t *
   for (int64_t begin = 0; begin < a->triangles; begin += STRIP) {
     int strip = a->triangles - begin < STRIP ? a->triangles - begin : STRIP;
     int K = find_active(s, a, begin, strip, place, count, onto, seen, slot, active);
-    weigh(s, a, begin, strip, mixed, place, count, onto, K, active, slot, weight);
+    weigh(s, a, begin, strip, exponent, change, place, count, onto, K, active, slot, weight);
     field_products(s, a, begin, strip, by_pair, fields, product);
     multiply('N', 'N', K, Q, strip, 1.0, weight, K, product, STRIP, 0.0, part, K);
     for (int q = 0; q < Q; q++)
@@ -656,8 +683,8 @@ int evaluate_slopes(const Sheet *s, const Areas *a, const Response *response, co
     onto[i * N + parameters] = rest * slopes[2 * n + i];
   }
   for (int64_t v = 0; v < M; v++) scale[v] = data->weight[v] / fabs(s->bare_voltages[v]);
-  int made = differentiate(s, a, n, p->where, p->potentials,
-                           p->mixes_resistivities ? p->change : NULL, N, onto, scale, jacobian);
+  int made = differentiate(s, a, n, p->where, p->potentials, p->exponent, p->change, N, onto,
+                           scale, jacobian);
   if (!made) undrift(s, data, N, jacobian, of);
   free(ratio);
   return made;
@@ -670,7 +697,7 @@ static const double MOST_BLURRED = 0.4;
 static const double PI = 3.14159265358979323846;
 
 typedef struct {
-  double half_width_m, offset_m, unit_kpa, blur_m2;
+  double half_width_m, grown_m2, unit_kpa, blur_m2;
   int64_t forms;    /* columns of the form that any contact has: 3, 5 or 9 */
   int64_t is_sharp; /* outlines as sharp as the points can show them */
 } Field;
@@ -682,11 +709,11 @@ typedef struct {
 } Contact;
 
 /* One contact and its hole as they are, and as they are drawn on a graded sheet: smaller, and stronger,
- * for the mesh's blur; how the logarithm of that size goes by that of its own, over 1, and by gamma;
- * the square of how far from its centre it may reach. */
+ * for the mesh's blur; how far outwards on a saturated one; how the logarithm of that size goes by
+ * that of its own, over 1, and by gamma; the square of how far from its centre it may reach. */
 typedef struct {
   Contact as_is, hole, smaller, smaller_hole;
-  double stronger, by_size, by_edge, reach2;
+  double wider, stronger, by_size, by_edge, reach2;
 } Sizes;
 
 /* An outline at a point: t = phi / w, log q, and their derivatives by the form. */
@@ -717,11 +744,13 @@ static Sizes sizes_of(const Field *f, const double *each) {
   double size = each[SIZE] + log(left) / 2, by_size = blur * (1 - held * held) / left;
   double longest = each[SIZE] + hypot(each[E1], each[E2]);
   for (int h = HARMONIC; h < PEAK; h++) longest += fabs(each[h]);
-  double reach = exp(longest) + 2 * (f->half_width_m + f->offset_m);
+  double wider = f->grown_m2 * exp(-each[SIZE]);
+  double reach = exp(longest) + 2 * (f->half_width_m + wider);
   return (Sizes){.as_is = contact_of(each, each[SIZE]),
                     .hole = contact_of(each, each[SIZE] - log(2)),
                     .smaller = contact_of(each, size),
                     .smaller_hole = contact_of(each, size - log(2)),
+                    .wider = wider,
                     .stronger = 1 / left,
                     .by_size = by_size,
                     .by_edge = -by_size / moment,
@@ -817,7 +846,7 @@ static int press(const Field *f, const Sizes *c, int is_ring, double x, double y
   double dx = x - UNIT_M * c->as_is.each[X], dy = y - UNIT_M * c->as_is.each[Y];
   if (dx * dx + dy * dy >= c->reach2) return 0;
   p->as_is.outline = outline_at(f, &c->as_is, x, y, with_slopes);
-  p->wide = p->as_is.outline.t + f->offset_m / f->half_width_m;
+  p->wide = p->as_is.outline.t + c->wider / f->half_width_m;
   if (p->wide <= -1) return 0;
   p->enclosed = step(f, p->wide);
   press_by(f, &c->as_is, is_ring ? &c->hole : NULL, x, y, with_slopes, &p->as_is);
@@ -955,6 +984,7 @@ int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, co
         double strength = share[q] * (sizes->stronger - stronger) -
                           2 * by * sizes->stronger * p->drawn.share;
         double enclosed = q < f->forms ? by_wide * p->as_is.outline.by_t[q] : 0.0;
+        if (q == SIZE) enclosed -= by_wide * sizes->wider / f->half_width_m;
         double within = enclosed * p->as_is.left + p->enclosed * left[q];
         by_enclosed[at] = enclosed * others_wide;
         by_enclosed_kpa[at] = (within * (p->as_is.pressure - as_is) +

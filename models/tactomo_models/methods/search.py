@@ -480,7 +480,10 @@ class Search:
         now: float,  # the log evidence of the field as it is
         frame: Frame,
         steps: int = STEPS,  # no more than these
-        sure: int = 0,  # of them before what is predicted to be hopeless is believed
+        # of them before what is predicted to be hopeless is believed. One where a start was likely:
+        # without, a ball on one graded sheet was surely an egg that presses evenly; with two, a
+        # cold frame has a solve more
+        sure: int = 1,
     ) -> Prediction:
         """What other contacts come to, by a fit that ends early where that is hopeless."""
         found = at_end(self.fit, solved, frame, own)

@@ -56,15 +56,19 @@ class _Areas(ctypes.Structure):
 
 class _Pressing(ctypes.Structure):
     _fields_ = (
-        *_integers("count", "mixes_resistivities"),
+        *_integers("count"),
         *_addresses("where", "share", "pressure"),
-        *_reals("log_ratio"),
+        *_reals("log_ratio", "exponent"),
         *_addresses("change", "voltages", "residual", "potentials", "injected"),
     )
 
 
 class _Response(ctypes.Structure):
-    _fields_ = (*_integers("saturates", "count"), *_addresses("pressure", "value"))
+    _fields_ = (
+        *_integers("saturates", "count"),
+        *_addresses("pressure", "value"),
+        *_reals("reflection"),
+    )
 
 
 class _Data(ctypes.Structure):
@@ -82,11 +86,15 @@ class CompiledResponse:
         pressure_kpa: (n,) of a table.
         value: (n,) relative change there; or share of the logarithm of the full change.
         saturates: which of the two. A table of no rows has all of the full change anywhere.
+        reflected: by a typical contact's outline, from 0 to 1; see `reflection`.
     """
 
-    def __init__(self, pressure_kpa: FloatArray, value: FloatArray, *, saturates: bool) -> None:
+    def __init__(
+        self, pressure_kpa: FloatArray, value: FloatArray, *, saturates: bool, reflected: float
+    ) -> None:
         self._kept = [np.ascontiguousarray(each, np.float64) for each in (pressure_kpa, value)]
-        self._response = _Response(saturates, len(value), *map(address, self._kept))
+        where = map(address, self._kept)
+        self._response = _Response(saturates, len(value), *where, reflected)
         self.address = ctypes.byref(self._response)  # for C
 
     def conductivity(
@@ -128,7 +136,7 @@ class Pressed:
     pressure_kpa: FloatArray  # (n,) on that share
     log_ratio: float  # logarithm of the structure sheet's ratio where it is saturated
     response: CompiledResponse
-    mixes_resistivities: bool  # see `ForwardModel.solve`
+    exponent: float  # see `ForwardModel.solve`
 
 
 class CompiledAreas:
@@ -172,9 +180,8 @@ class Solution:
     # potentials on the rims and everywhere outside
     injected: FloatArray
     areas: CompiledAreas = field(repr=False)
-    # (P,) changes at the pressable nodes, whose resistivities were mixed where it says so
-    change: FloatArray = field(repr=False)
-    mixes_resistivities: bool
+    change: FloatArray = field(repr=False)  # (P,) at the pressable nodes
+    exponent: float  # that it was solved with
 
 
 class CompiledSheet:
@@ -231,21 +238,20 @@ class CompiledSheet:
             return None
         return np.ascontiguousarray(self.bare.green.between(areas.rim, areas.rim))
 
-    def solve(self, change: FloatArray, *, mix_resistivities: bool = False) -> Solution:
+    def solve(self, change: FloatArray, exponent: float = 1.0) -> Solution:
         """Solve for a pressed sheet.
 
         Args:
             change: (P,) conductivity minus the bare sheet's at the pressable nodes.
-            mix_resistivities: a triangle's resistivity, not its conductivity, is the mean of its
-                corners'. Across the edge of what conducts far better than the sheet, current
-                meets the two in series: there this keeps an edge where its nodes put it, whatever
-                the contrast (to 0.3 mm of 3 mm triangles; otherwise it is off by up to 0.9 mm).
-                Triangles with a corner that conducts worse than the sheet mix conductivities.
+            exponent: of the power mean of its corners that a triangle has; 1 is the mean of
+                conductivities, -1 that of resistivities, 0 that of logarithms. Below 0, triangles
+                with a corner that conducts worse than at rest have it with the other sign. See
+                `reflection`.
 
         Raises numpy.linalg.LinAlgError where a conductivity is not above 0.
         """
         where = np.flatnonzero(change)
-        pressing = _Pressing(len(where), mix_resistivities, 0)
+        pressing = _Pressing(len(where), exponent=exponent)
         return self._solve(where, pressing, change=change)[0]
 
     def evaluate(self, pressed: Pressed, data: CompiledData) -> tuple[Solution, FloatArray]:
@@ -297,7 +303,7 @@ class CompiledSheet:
             kept[ends[3] :].reshape(sheet.fields, found.rim).T,
             areas,
             kept[: ends[0]],
-            bool(pressing.mixes_resistivities),
+            pressing.exponent,
         )
         return solution, kept[ends[1] : ends[2]]
 
@@ -312,10 +318,7 @@ class CompiledSheet:
         """Derivative (M, N + 1) of the weighted residual, by the parameters and the log ratio."""
         areas, potentials = self._around(solution, pressed.where)
         pressing = _pressing(pressed)
-        pressing.where, pressing.mixes_resistivities = (
-            address(areas.where),
-            solution.mixes_resistivities,
-        )
+        pressing.where, pressing.exponent = address(areas.where), solution.exponent
         pressing.change, pressing.potentials = address(solution.change), address(potentials)
         jacobian = np.empty((self._sheet.voltages, by_share.shape[1] + 1))
         made = LIBRARY.evaluate_slopes(
@@ -366,12 +369,13 @@ class CompiledSheet:
         onto = None if onto is None else np.ascontiguousarray(onto, np.float64)
         count = len(areas.where) if onto is None else onto.shape[1]
         jacobian = np.empty((self._sheet.voltages, count))
-        mixed = solution.change if solution.mixes_resistivities else None
         made = LIBRARY.differentiate(
             self._address,
             ctypes.byref(areas.found),
             len(areas.where),
-            *(at(each) for each in (areas.where, potentials, mixed)),
+            *map(at, (areas.where, potentials)),
+            solution.exponent,
+            at(solution.change),
             count,
             *(at(each) for each in (onto, self._even, jacobian)),
         )
@@ -383,12 +387,25 @@ def _pressing(pressed: Pressed) -> _Pressing:
     """What presses, for C; which of the areas' nodes that is about is still to be said."""
     return _Pressing(
         len(pressed.where),
-        pressed.mixes_resistivities,
         0,
         address(pressed.share),
         address(pressed.pressure_kpa),
         pressed.log_ratio,
+        pressed.exponent,
     )
+
+
+def reflection(ratio: FloatArray | float) -> FloatArray:
+    """How much of a field the outline of what conducts `ratio` times as well reflects.
+
+    From 1 (what does not conduct) to -1 (what conducts perfectly), of the ratio's shape,
+    k = (1 - c) / (1 + c). It is the exponent of the power mean by which the two conductivities mix
+    where an outline is drawn over some width. There the share s of what is inside falls from 1 to
+    0, evenly; currents along it gain Int sigma(s) ds - (1 + c) / 2, and those across it lose
+    c^2 (Int ds / sigma(s) - (1 + 1 / c) / 2). With this exponent the two are equal, and what is
+    drawn answers as with a sharp outline, to first order in the width.
+    """
+    return np.asarray((1 - np.asarray(ratio)) / (1 + np.asarray(ratio)))
 
 
 def positions(members: IntArray, count: int) -> IntArray:

@@ -143,6 +143,11 @@ class ForwardModel(CompiledSheet):
         self._closed = left < 1e-9 * (abs(law) @ np.abs(self.bare.potentials)).max(axis=1)
 
     @property
+    def triangle_areas_m2(self) -> FloatArray:
+        """(t,) area of each triangle that pressing changes."""
+        return self._area
+
+    @property
     def node_areas_m2(self) -> FloatArray:
         """(P,) share of the sheet's area that belongs to each pressable node."""
         return np.asarray(np.append(self._area, 0.0)[self._triangles_of].sum(axis=1) / 3)

@@ -228,9 +228,9 @@ class FieldFit:
         share, pressure = drawing.share, drawing.pressure_kpa
         if name == Channel.STRUCTURE:
             share, pressure = drawing.enclosed, drawing.enclosed_kpa
-        rises = response.rises(log_ratio)
         share, pressure = _for_c(share), _for_c(pressure)
-        return Pressed(drawing.nodes, share, pressure, log_ratio, response.compiled, rises)
+        exponent = response.exponent(log_ratio)
+        return Pressed(drawing.nodes, share, pressure, log_ratio, response.compiled, exponent)
 
     def _residual(self, name: Channel, solution: Solution, changes: Changes) -> FloatArray:
         bare = self.sheet(name).bare_voltages

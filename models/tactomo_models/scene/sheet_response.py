@@ -1,9 +1,8 @@
 """What a pressure does to each sheet: its conductivity, and how that changes with the pressure.
 
-One pressure field presses on all sheets. A node that is pressed in part conducts in between. On a
-saturated sheet the worse conductor has that share of the say: resistivities mix where pressing
-makes it conduct better, conductivities where worse, so that an outline stands where the voltages
-put it, whatever the contrast. On a graded sheet, whose contrast is mild, conductivities mix.
+One pressure field presses on all sheets. A node that is pressed in part conducts in between, and so
+does a triangle whose corners differ: by the power mean with which an outline that is drawn over
+some width answers as a sharp one (`reflection`); with that of a typical press, everywhere alike.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import numpy as np
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
-from tactomo_models.physics.compiled_sheet import CompiledResponse
+from tactomo_models.physics.compiled_sheet import CompiledResponse, reflection
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.response import MagnitudeResponse, StructureChannel
 
@@ -41,8 +40,8 @@ class SheetResponse(Protocol):
             The ratio, its derivatives by share, by pressure and by the log ratio, each (n,).
         """
 
-    def rises(self, log_ratio: float) -> bool:
-        """Whether pressing makes the sheet conduct better."""
+    def exponent(self, log_ratio: float) -> float:
+        """Of the power mean by which triangles mix what their corners conduct."""
 
     @property
     def compiled(self) -> CompiledResponse:
@@ -98,11 +97,20 @@ class GradedResponse:
     @cached_property
     def compiled(self) -> CompiledResponse:
         """See `SheetResponse`."""
-        return CompiledResponse(self.pressure_kpa, self.change, saturates=False)
+        reflected = self.reflected
+        return CompiledResponse(
+            self.pressure_kpa, self.change, saturates=False, reflected=reflected
+        )
 
-    def rises(self, log_ratio: float) -> bool:
+    @cached_property
+    def reflected(self) -> float:
+        """By the outline of a press in the middle of what the table answers to, from 0 to 1."""
+        change, _ = self.relative_change(np.array([(self.onset_kpa + self.end_kpa) / 2]))
+        return abs(float(reflection(1 + change)[0]))
+
+    def exponent(self, log_ratio: float) -> float:
         """See `SheetResponse`."""
-        return bool(self.change[-1] > 0)
+        return float(-np.copysign(self.reflected, self.change[-1]))
 
 
 @dataclass(frozen=True)
@@ -114,14 +122,16 @@ class SaturatingResponse:
 
     pressure_kpa: FloatArray  # (n,) of the description's table; empty where any pressure saturates
     share: FloatArray  # (n,) of the logarithm of the saturated ratio, from 0 to 1
+    reflected: float = 0.98  # by an outline where the sheet is saturated, from 0 to 1
 
     @classmethod
     def of(cls, channel: StructureChannel) -> SaturatingResponse:
         """The response that a description gives."""
+        reflected = abs(float(reflection(channel.saturated_ratio)))
         if channel.response is None:
-            return cls(np.zeros(0), np.zeros(0))
+            return cls(np.zeros(0), np.zeros(0), reflected)
         logs = np.log(channel.response.conductivity_ratio)
-        return cls(np.asarray(channel.response.pressure_kpa), logs / logs[-1])
+        return cls(np.asarray(channel.response.pressure_kpa), logs / logs[-1], reflected)
 
     @cached_property
     def _slopes(self) -> FloatArray:
@@ -152,11 +162,12 @@ class SaturatingResponse:
     @cached_property
     def compiled(self) -> CompiledResponse:
         """See `SheetResponse`."""
-        return CompiledResponse(self.pressure_kpa, self.share, saturates=True)
+        reflected = self.reflected
+        return CompiledResponse(self.pressure_kpa, self.share, saturates=True, reflected=reflected)
 
-    def rises(self, log_ratio: float) -> bool:
+    def exponent(self, log_ratio: float) -> float:
         """See `SheetResponse`."""
-        return bool(log_ratio > 0)
+        return float(-np.copysign(self.reflected, log_ratio))
 
 
 def responses_of(description: SensorDescription) -> dict[Channel, SheetResponse]:

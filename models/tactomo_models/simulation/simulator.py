@@ -13,6 +13,7 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.bare_sheet import scan_voltages, solve_bare_sheet, transfer_resistances
+from tactomo_models.physics.compiled_sheet import reflection
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import mesh_sheet
 from tactomo_models.scene.press import Press, strongest
@@ -99,8 +100,8 @@ class SkinSimulator:
     def solve(self, ratio: FloatArray) -> FloatArray:
         """Noise-free volts (M,) where those nodes conduct so many times better, (P,)."""
         change = self._background * (ratio - 1)
-        # Across the edge of a good conductor resistivities mix; see `ForwardModel.solve`.
-        solved = self.forward.solve(change, mix_resistivities=bool(np.all(ratio >= 1)))
+        farthest = ratio[np.abs(np.log(np.maximum(ratio, 1e-9))).argmax()]
+        solved = self.forward.solve(change, float(reflection(farthest)))
         return solved.voltages * self.forward.volts_per_unit
 
     def smooth_field(self, rng: np.random.Generator) -> FloatArray:
@@ -136,8 +137,7 @@ def conductivity_ratio(
 ) -> FloatArray:
     """Conductivity over the bare sheet's at each point, same shape.
 
-    A point that an indenter covers in part has that share of the worse conductor's say:
-    resistivities mix where it conducts better under pressure, conductivities where worse.
+    A point that an indenter covers in part conducts in between, see `blended`.
     """
     if channel == Channel.MAGNITUDE:
         assert description.magnitude is not None
@@ -147,8 +147,19 @@ def conductivity_ratio(
         response = description.structure.response
         saturated = np.where(pressure_kpa > 0, description.structure.saturated_ratio, 1.0)
         full = response.ratio(pressure_kpa) if response else saturated
-    mixed = 1 - coverage + coverage * np.minimum(full, 1 / full)
-    return np.asarray(np.where(full > 1, 1 / mixed, mixed))
+    return blended(full, coverage)
+
+
+def blended(full: FloatArray, coverage: FloatArray) -> FloatArray:
+    """Conductivity ratios of points of which a share (0 to 1) conducts `full` times as well.
+
+    It is the power mean whose exponent is the reflection; see there.
+    """
+    k = reflection(full)
+    even = np.abs(k) < 1e-6  # its limit, the geometric mean
+    power = np.where(even, 1.0, k)
+    mixed = np.log1p(coverage * np.expm1(power * np.log(full))) / power
+    return np.asarray(np.exp(np.where(even, coverage * np.log(full), mixed)))
 
 
 def smooth_noise(

@@ -144,6 +144,24 @@ def test_whatever_is_pressed_equals_a_solve_of_the_whole_system(
     assert np.abs(off / uneven.bare_voltages).max() < 1e-7
 
 
+@pytest.mark.parametrize("exponent", [-0.9, -0.3, 0.0, 0.5, 1.0])
+@pytest.mark.parametrize("contrast", [0.01, 3.0])
+def test_the_jacobian_is_the_slope_however_triangles_mix(
+    uneven: ForwardModel, exponent: float, contrast: float
+) -> None:
+    """Of an uneven sheet, up to where a press leaves it next to no conductivity."""
+    x, y = uneven.bare.points[:, uneven.bare.pressable]
+    where = np.flatnonzero(np.hypot(x - 0.004, y) < 0.008)
+    change, aside = np.zeros((2, len(x)))
+    change[where] = uneven.at_rest[where] * (contrast - 1)
+    aside[where] = uneven.at_rest[where] * np.cos(300 * x[where])
+    step = 1e-4 * contrast
+    up, down = (uneven.solve(change + side * step * aside, exponent).voltages for side in (1, -1))
+    solution = uneven.solve(change, exponent)
+    slope = uneven.jacobian(solution, where, aside[where, None])[:, 0]
+    np.testing.assert_allclose(slope, (up - down) / (2 * step), rtol=1e-5, atol=1e-8)
+
+
 def test_what_has_no_conductivity_left_has_no_solution(model: ForwardModel) -> None:
     with pytest.raises(np.linalg.LinAlgError, match="conductivity"):
         model.solve(np.where(bump(model, 2.0) > 0, -2.0, 0.0))

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from tactomo_models import Artifact, Press, SensorDescription, SkinSimulator
 from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.simulation.simulator import blended
 from tactomo_protocol import Channel
 from variants import variant
 
@@ -50,6 +53,31 @@ def test_a_falling_sensor_goes_the_other_way(
         rising = bench.voltages([press(180)])[name] - rest
         fallen = other.voltages([press(180)])[name] - rest
         assert float(np.sign(rising) @ np.sign(fallen)) < -0.9 * len(rest)
+
+
+@given(st.floats(-4.6, 4.6))
+def test_an_outline_that_is_drawn_over_some_width_answers_as_a_sharp_one(log_ratio: float) -> None:
+    """Along it, currents gain what they lose across it, to first order in its width."""
+    full = np.exp(log_ratio)
+    coverage = (np.arange(2000) + 0.5) / 2000
+    ratio = blended(full, coverage)
+    along = ratio.mean() - (1 + full) / 2
+    across = full**2 * ((1 / ratio).mean() - (1 + 1 / full) / 2)
+    assert along == pytest.approx(across, abs=1e-6 * max(full, 1) ** 2)
+
+
+@pytest.mark.parametrize("change", [2.0, -0.6])
+def test_a_press_on_a_graded_sheet_answers_alike_on_a_coarse_and_a_fine_mesh(
+    small: SensorDescription, change: float
+) -> None:
+    response = {"pressure_kpa": [0.0, 200.0], "relative_change": [0.0, change]}
+    graded = variant(small, magnitude={"response": response})
+    name, pressed = Channel.MAGNITUDE, [press(190, 0.006)]
+    coarse, fine = (
+        skin.voltages(pressed)[name] - skin.voltages([])[name]
+        for skin in (SkinSimulator(graded, spacing_m) for spacing_m in (0.002, 0.0007))
+    )
+    assert coarse @ fine / (fine @ fine) == pytest.approx(1, abs=0.02)
 
 
 def test_a_press_off_the_sheet_or_of_no_pressure_is_none(bench: SkinSimulator) -> None:
