@@ -615,8 +615,8 @@ static void field_products(const Sheet *s, const Areas *a, int64_t begin, int st
  *
  * where: (nodes,) pressable nodes that the areas are around. potentials: (n, fields).
  * exponent, change: of the triangles' power mean, and what was solved for (pressable,). onto:
- * (nodes, count) derivatives of
- * these nodes' conductivities by the parameters; NULL where they are the parameters themselves.
+ * (nodes, count) derivatives of these nodes' conductivities by the parameters; NULL where they are
+ * the parameters themselves.
  * scale: (voltages,). Out: (voltages, count).
  */
 int differentiate(const Sheet *s, const Areas *a, int64_t nodes, const int64_t *where,
@@ -747,13 +747,13 @@ static Sizes sizes_of(const Field *f, const double *each) {
   double wider = f->grown_m2 * exp(-each[SIZE]);
   double reach = exp(longest) + 2 * (f->half_width_m + wider);
   return (Sizes){.as_is = contact_of(each, each[SIZE]),
-                    .hole = contact_of(each, each[SIZE] - log(2)),
-                    .smaller = contact_of(each, size),
-                    .smaller_hole = contact_of(each, size - log(2)),
-                    .wider = wider,
-                    .stronger = 1 / left,
-                    .by_size = by_size,
-                    .by_edge = -by_size / moment,
+                 .hole = contact_of(each, each[SIZE] - log(2)),
+                 .smaller = contact_of(each, size),
+                 .smaller_hole = contact_of(each, size - log(2)),
+                 .wider = wider,
+                 .stronger = 1 / left,
+                 .by_size = by_size,
+                 .by_edge = -by_size / moment,
                     .reach2 = reach * reach};
 }
 

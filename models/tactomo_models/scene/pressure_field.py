@@ -31,7 +31,6 @@ import numpy as np
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.inner_loop import LIBRARY, address, at
-from tactomo_models.physics.compiled_sheet import reflection
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scene.drawing import GRADED_WIDTH, Drawing, Slopes
 from tactomo_models.scene.parameters import (
@@ -53,7 +52,7 @@ from tactomo_models.scene.parameters import (
     X,
     Y,
 )
-from tactomo_models.scene.sheet_response import GradedResponse
+from tactomo_models.scene.sheet_response import GradedResponse, SaturatingResponse
 
 BELOW = 1 - 1e-9  # of the onset: a peak there leaves no trace, and the table has no slope
 
@@ -105,7 +104,7 @@ class PressureField:
             graded: the magnitude sheet's response; None where there is none.
         """
         structure, grown = forward.description.structure, 0.53 / 2  # see above
-        reflected = abs(float(reflection(structure.saturated_ratio))) if structure else 0.0
+        reflected = SaturatingResponse.of(structure).reflected if structure else 0.0
         # A triangle has the mean of its corners, which spreads what is on a node over its hexagon;
         # and then there is the step from 1 to 0. ICC of tuning scenes without and with it: 0.989,
         # 0.991 at 40 dB, 0.954, 0.960 at 20 dB, 0.979, 0.981 of one graded sheet.

@@ -97,10 +97,8 @@ class GradedResponse:
     @cached_property
     def compiled(self) -> CompiledResponse:
         """See `SheetResponse`."""
-        reflected = self.reflected
-        return CompiledResponse(
-            self.pressure_kpa, self.change, saturates=False, reflected=reflected
-        )
+        given = self.pressure_kpa, self.change
+        return CompiledResponse(*given, saturates=False, reflected=self.reflected)
 
     @cached_property
     def reflected(self) -> float:
@@ -122,7 +120,7 @@ class SaturatingResponse:
 
     pressure_kpa: FloatArray  # (n,) of the description's table; empty where any pressure saturates
     share: FloatArray  # (n,) of the logarithm of the saturated ratio, from 0 to 1
-    reflected: float = 0.98  # by an outline where the sheet is saturated, from 0 to 1
+    reflected: float  # by an outline where the sheet is saturated, from 0 to 1
 
     @classmethod
     def of(cls, channel: StructureChannel) -> SaturatingResponse:
@@ -162,8 +160,8 @@ class SaturatingResponse:
     @cached_property
     def compiled(self) -> CompiledResponse:
         """See `SheetResponse`."""
-        reflected = self.reflected
-        return CompiledResponse(self.pressure_kpa, self.share, saturates=True, reflected=reflected)
+        given = self.pressure_kpa, self.share
+        return CompiledResponse(*given, saturates=True, reflected=self.reflected)
 
     def exponent(self, log_ratio: float) -> float:
         """See `SheetResponse`."""

@@ -100,8 +100,8 @@ class SkinSimulator:
     def solve(self, ratio: FloatArray) -> FloatArray:
         """Noise-free volts (M,) where those nodes conduct so many times better, (P,)."""
         change = self._background * (ratio - 1)
-        farthest = ratio[np.abs(np.log(np.maximum(ratio, 1e-9))).argmax()]
-        solved = self.forward.solve(change, float(reflection(farthest)))
+        least, most = float(ratio.min()), float(ratio.max())
+        solved = self.forward.solve(change, float(reflection(most if least * most > 1 else least)))
         return solved.voltages * self.forward.volts_per_unit
 
     def smooth_field(self, rng: np.random.Generator) -> FloatArray:

@@ -18,8 +18,8 @@ TABLE_KPA = np.array([0.0, 80.0, 150.0, 200.0])
 RESPONSES: dict[str, SheetResponse] = {
     "rising": GradedResponse(TABLE_KPA, np.array([0.0, 0.0, 0.4, 1.5])),
     "falling": GradedResponse(TABLE_KPA, np.array([0.0, 0.0, -0.1, -0.3])),
-    "saturating": SaturatingResponse(TABLE_KPA, np.array([0.0, 0.2, 0.9, 1.0])),
-    "saturated": SaturatingResponse(np.zeros(0), np.zeros(0)),
+    "saturating": SaturatingResponse(TABLE_KPA, np.array([0.0, 0.2, 0.9, 1.0]), 0.98),
+    "saturated": SaturatingResponse(np.zeros(0), np.zeros(0), 0.98),
 }
 log_ratios = st.floats(-7, 7).filter(lambda ratio: abs(ratio) > 0.1)
 

@@ -47,7 +47,7 @@ def taken_up(
     made: PressureCalibration | TaughtSkin, path: Path, address: str | None, keys: Path | None
 ) -> str:
     """Have the sensor's daemon, if it runs, use what was kept; say in words what became of it."""
-    from tactomo_client import CalibrationRefused, ClientError
+    from tactomo_client import CalibrationRefused, ClientError, KeysError
     from tactomo_models.calibration.calibration_file import PressureCalibration, calibration_path
     from tactomo_models.calibration.taught_skin import taught_path
 
@@ -58,11 +58,16 @@ def taken_up(
         found = _reloaded(find_control(sensor, address, keys), keys)
     except CalibrationRefused as error:
         return f"not in force: the daemon of {sensor} refused it: {error}"
+    except KeysError as error:
+        return (
+            f"not in force yet: {error.cause}. Have somebody who may command run {again}, or start "
+            "the daemon anew"
+        )
     except (ClientError, SensorError) as error:
         it = "It" if path.absolute() == own.absolute() else f"Copied to {own}, it"
         later = f"{it} is in force when the daemon of {sensor} starts next, or by: {again}"
         return f"not in force yet: {error.cause}. {later}"
-    if made.taken in [each.taken for each in (found.calibration, found.taught) if each]:
+    if _is_in_force(made, found):
         return f"in force now: the daemon of {sensor} goes by it"
     return (
         f"not in force: the daemon of {sensor} goes by {_words(found)}. It looks on its own "
@@ -76,6 +81,16 @@ def _reloaded(control: str, keys: Path | None) -> CalibrationInForce:
 
     with Daemon(control, keys=keys, connect_timeout_s=CONNECT_S) as daemon:
         return daemon.reload_calibration()
+
+
+def _is_in_force(made: PressureCalibration | TaughtSkin, found: CalibrationInForce) -> bool:
+    from tactomo_models.calibration.calibration_file import PressureCalibration
+
+    if not isinstance(made, PressureCalibration):
+        return found.taught is not None and found.taught.taken == made.taken
+    its = found.calibration
+    kept = (made.taken, len(made.readings), made.curve.range_kpa)
+    return its is not None and (its.taken, its.readings, its.range_kpa) == kept
 
 
 def _words(found: CalibrationInForce) -> str:
