@@ -34,7 +34,9 @@ def tared(daemon: DaemonProcess) -> None:
     wait_until(lambda: daemon.told("tared"), "a reference")
 
 
-def press(twin: Twin, x_mm: float, y_mm: float, radius_mm: float = 9.0) -> None:
+def press(twin: Twin, x_mm: float, y_mm: float) -> None:
+    """Press as large a disc as the coarse map resolves: three of its cells in radius."""
+    radius_mm = 15.0
     request("press", twin.control, PATIENCE_S, x_mm=x_mm, y_mm=y_mm, radius_mm=radius_mm)
 
 

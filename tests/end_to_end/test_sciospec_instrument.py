@@ -80,14 +80,13 @@ def test_an_instrument_is_configured_believed_and_stopped(start: Start, tmp_path
 def test_a_daemon_that_was_killed_leaves_it_measuring_and_the_next_takes_over(
     start: Start, tmp_path: Path
 ) -> None:
-    twin, daemon = start(changed(tmp_path, TANK))
+    tank = changed(tmp_path, TANK)
+    twin, daemon = start(tank)
     wait_until(lambda: daemon.told("tared"), "a reference")
     daemon.signal(signal.SIGKILL)
     daemon.popen.wait(PATIENCE_S)
     assert is_streaming(twin)
-    again = DaemonProcess(
-        tmp_path, twin.ports, protocol="sciospec", description=str(tmp_path / "tank.toml")
-    )
+    again = DaemonProcess(tmp_path, twin.ports, protocol="sciospec", description=tank)
     try:
         wait_until(lambda: again.told("tared"), "a reference of the next daemon")
         [port] = again.status()["ports"]
