@@ -12,8 +12,8 @@ from recorded_grasp import SENSOR, contacts_of
 from tactomo.recordings.recording import open_recording
 from tactomo_client.recording import open_recording as open_frames
 from tactomo_models.archive import read_arrays
-from tactomo_models.calibration.calibration_file import read_calibration
-from tactomo_models.calibration.taught_skin import read_taught
+from tactomo_models.calibration.calibration_file import CALIBRATIONS
+from tactomo_models.calibration.taught_skin import TAUGHT
 
 HERE = Path(__file__).parent
 
@@ -28,7 +28,7 @@ def test_a_recording(tactomo: Callable[..., Any]) -> None:
 
 
 def test_a_calibration() -> None:
-    curve = read_calibration(HERE / "pressure-1.json").curve
+    curve = CALIBRATIONS.read(HERE / "pressure-1.json").curve
     np.testing.assert_allclose(np.interp(0.07, curve.magnitude, curve.pressure_kpa), 170, atol=1)
 
 
@@ -39,7 +39,7 @@ def test_a_taught_skin(tmp_path: Path, forces: bool) -> None:
     for name in () if forces else ("loads", "force_n", "force_error"):
         del arrays[name]
     np.savez(tmp_path / "taught.npz", **arrays)  # type: ignore[arg-type]
-    taught = read_taught(tmp_path / "taught.npz")
+    taught = TAUGHT.read(tmp_path / "taught.npz")
     assert len(taught.xy_mm) == 40
     assert taught.with_mm == pytest.approx(0.36, abs=0.01)
     assert (taught.forces is not None) == forces

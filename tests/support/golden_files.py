@@ -14,11 +14,7 @@ from pathlib import Path
 import numpy as np
 from handmade_skin import described, presses, write_description
 from recorded_grasp import write_grasp
-from tactomo_models.calibration.calibration_file import (
-    PressureCalibration,
-    Subject,
-    save_calibration,
-)
+from tactomo_models.calibration.calibration_file import CALIBRATIONS, PressureCalibration, Subject
 from tactomo_models.calibration.curve import Reading
 
 FOLDER = Path(__file__).parents[1] / "golden"
@@ -31,7 +27,9 @@ def main() -> None:
     readings = [
         Reading(pressure_kpa=kpa, magnitude=1e-3 * (kpa - 100)) for kpa in range(110, 270, 20)
     ]
-    save_calibration(PressureCalibration.of_readings(subject, readings), FOLDER / "pressure-1.json")
+    CALIBRATIONS.save(
+        PressureCalibration.of_readings(subject, readings), FOLDER / "pressure-1.json"
+    )
     with tempfile.TemporaryDirectory() as folder:
         np.savez(Path(folder) / "presses.npz", **presses(40, seed=1))
         sensor = write_description(Path(folder) / "skin.toml")

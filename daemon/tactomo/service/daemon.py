@@ -51,11 +51,11 @@ from tactomo_models import (
     shipped_descriptions,
 )
 from tactomo_models.calibration.calibration_file import (
+    CALIBRATIONS,
     PressureCalibration,
     calibration_for,
-    load_calibration,
 )
-from tactomo_models.calibration.taught_skin import TaughtSkin, load_taught, taught_path
+from tactomo_models.calibration.taught_skin import TAUGHT, TaughtSkin
 from tactomo_models.methods.registry import available_methods, check_method
 from tactomo_models.sensor.description_file import carried_text
 from tactomo_protocol import Channel
@@ -555,13 +555,8 @@ def _find_calibration(
     if description.magnitude is None:
         return None, unused
     if config.calibration is not None:
-        try:
-            return load_calibration(config.calibration, config.name, description), unused
-        except FileNotFoundError as error:
-            raise CalibrationError(
-                f"there is no calibration {config.calibration}; run: tactomo calibrate "
-                f"live --sensor {config.name}, or leave the key out"
-            ) from error
+        step = f"{CALIBRATIONS.again(config.name)}, or leave the key out"
+        return CALIBRATIONS.load(config.calibration, config.name, description, step), unused
     if replay is not None and replay.knows_calibration:
         return replay.calibration, unused
     found = calibration_for(config.name, description, file, unused.append)
@@ -575,7 +570,7 @@ def _find_taught(
     if replay is not None:
         return None
     try:
-        return load_taught(taught_path(config.name), config.name, description)
+        return TAUGHT.load(TAUGHT.path(config.name), config.name, description)
     except FileNotFoundError:
         return None
     except CalibrationError as error:

@@ -8,13 +8,13 @@ another device would have another curve.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import IO, Annotated, Final, Literal, Self
+from typing import IO, Annotated, Final, Generic, Literal, Protocol, Self, TypeVar
 
 import numpy as np
 from platformdirs import user_data_path
@@ -28,7 +28,6 @@ from tactomo_models.scene.pressure import PressureCurve
 from tactomo_models.sensor.description import SensorDescription
 
 SUFFIX: Final = ".pressure.json"
-READABLE: Final = "put a file there that may be read, or nothing"
 Points = Annotated[tuple[float, ...], Field(min_length=2, max_length=256)]
 
 
@@ -174,47 +173,86 @@ def data_folder() -> Path:
     return Path(state) if state else user_data_path("tactomo")
 
 
-def calibration_path(sensor: str) -> Path:
-    """Where a sensor's calibration is kept by default."""
-    return data_folder() / "calibrations" / f"{sensor}{SUFFIX}"
+class Kept(Protocol):
+    """What is kept of one sensor."""
+
+    @property
+    def subject(self) -> Subject:
+        """What it is of."""
+
+    @property
+    def taken(self) -> str:
+        """When it was made, ISO 8601, UTC."""
 
 
-def save_calibration(calibration: PressureCalibration, path: Path) -> None:
-    """Write a calibration; a half-written one is never left under that name.
-
-    Raises CalibrationError where the file cannot be written.
-    """
-    content = (calibration.model_dump_json(indent=1) + "\n").encode()
-    write_kept(path, lambda file: file.write(content))
+Made = TypeVar("Made", bound=Kept)
 
 
-def read_calibration(path: Path) -> PressureCalibration:
-    """Read a calibration, whatever it is of.
+@dataclass(frozen=True)
+class KeptFiles(Generic[Made]):
+    """The files of one kind that sensors keep, one each: where they are, read and written."""
 
-    Raises:
-        CalibrationError: it is damaged, of another format, or cannot be read.
-        FileNotFoundError: there is none.
-    """
-    with reading(path, READABLE):
-        return parse_calibration(read_regular(path, MAX_TEXT_BYTES), str(path))
+    suffix: str  # of their names
+    command: str  # of `tactomo` that makes one
+    missing: str  # that there is none, in words that its path follows
+    unreadable: str  # what to do about one that cannot be read
+    parse: Callable[[Path], Made]  # reads one; raises OSError, or CalibrationError
+    write: Callable[[Made, IO[bytes]], object]
 
+    def path(self, sensor: str) -> Path:
+        """Where a sensor's is kept by default."""
+        return data_folder() / "calibrations" / f"{sensor}{self.suffix}"
 
-def write_kept(path: Path, write: Callable[[IO[bytes]], object]) -> None:
-    """Write what a sensor keeps, as a whole; raise CalibrationError where that cannot be done."""
-    next_step = "name a file that you may write"
-    with os_errors_as(CalibrationError, f"cannot write {path}", next_step):
-        write_whole(path, write)
+    def again(self, sensor: str) -> str:
+        """In words, how to make a sensor's anew."""
+        return f"run: tactomo {self.command} live --sensor {sensor}"
 
+    def save(self, made: Made, path: Path) -> None:
+        """Write one; a half-written one is never left under that name.
 
-@contextmanager
-def reading(path: Path, next_step: str) -> Iterator[None]:
-    """Raise CalibrationError for a file that cannot be read, FileNotFoundError for none."""
-    try:
-        yield
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise CalibrationError(f"cannot read {path}: {error.strerror}; {next_step}") from error
+        Raises CalibrationError where the file cannot be written.
+        """
+        next_step = "name a file that you may write"
+        with os_errors_as(CalibrationError, f"cannot write {path}", next_step):
+            write_whole(path, lambda file: self.write(made, file))
+
+    def read(self, path: Path, next_step: str = "") -> Made:
+        """Read one, whatever it is of.
+
+        Raises:
+            CalibrationError: it is damaged, of another format, or cannot be read; or there is none
+                and `next_step` says what to do then.
+            FileNotFoundError: there is none, and no step.
+        """
+        try:
+            return self.parse(path)
+        except FileNotFoundError as error:
+            if not next_step:
+                raise
+            raise CalibrationError(f"{self.missing} {path}; {next_step}") from error
+        except OSError as error:
+            why = f"cannot read {path}: {error.strerror}; {self.unreadable}"
+            raise CalibrationError(why) from error
+
+    def load(
+        self, path: Path, sensor: str, description: SensorDescription, next_step: str = ""
+    ) -> Made:
+        """Read one and make sure that it is of this sensor.
+
+        Raises as `read` does, and CalibrationError where it is of another one.
+        """
+        found = self.read(path, next_step)
+        found.subject.check(path, description, self.again(sensor), sensor)
+        return found
+
+    def of(self, description: SensorDescription, path: Path) -> Made:
+        """Read one of a sensor of such a description, whatever its name.
+
+        Raises CalibrationError where it cannot be read, is of another one, or there is none.
+        """
+        found = self.read(path, "give another path")
+        found.subject.check(path, description, "give the one of this sensor")
+        return found
 
 
 def parse_calibration(content: bytes | str, source: str) -> PressureCalibration:
@@ -237,32 +275,14 @@ def parse_calibration(content: bytes | str, source: str) -> PressureCalibration:
         ) from error
 
 
-def load_calibration(
-    path: Path, sensor: str, description: SensorDescription
-) -> PressureCalibration:
-    """Read a calibration and make sure that it is of this sensor.
-
-    Raises:
-        CalibrationError: it is not, or see `read_calibration`.
-        FileNotFoundError: there is none.
-    """
-    found = read_calibration(path)
-    found.subject.check(path, description, f"run: tactomo calibrate live --sensor {sensor}", sensor)
-    return found
-
-
-def calibration_of(description: SensorDescription, path: Path) -> PressureCalibration:
-    """Read a calibration of such a sensor, whatever its name.
-
-    Raises:
-        CalibrationError: there is none, or it is of another description; see `read_calibration`.
-    """
-    try:
-        found = read_calibration(path)
-    except FileNotFoundError as error:
-        raise CalibrationError(f"there is no calibration {path}; give another path") from error
-    found.subject.check(path, description, "give the one of this sensor")
-    return found
+CALIBRATIONS: Final = KeptFiles(
+    SUFFIX,
+    "calibrate",
+    "there is no calibration",
+    "put a file there that may be read, or nothing",
+    lambda path: parse_calibration(read_regular(path, MAX_TEXT_BYTES), str(path)),
+    lambda made, file: file.write((made.model_dump_json(indent=1) + "\n").encode()),
+)
 
 
 def calibration_for(
@@ -277,9 +297,9 @@ def calibration_for(
     It is looked for in the data folder by the sensor's name, then beside its description's file.
     """
     beside = [] if file is None else [file.with_suffix(SUFFIX)]
-    for path in [calibration_path(sensor), *beside]:
+    for path in [CALIBRATIONS.path(sensor), *beside]:
         try:
-            return load_calibration(path, sensor, description)
+            return CALIBRATIONS.load(path, sensor, description)
         except FileNotFoundError:
             continue
         except CalibrationError as error:

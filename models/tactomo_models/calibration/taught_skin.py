@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
 import numpy as np
 from pydantic import ValidationError
@@ -20,20 +20,18 @@ from tactomo_protocol import Channel
 from tactomo_models.archive import read_arrays
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.calibration.calibration_file import (
+    KeptFiles,
     Subject,
-    data_folder,
-    reading,
-    write_kept,
 )
 from tactomo_models.calibration.press_regression import ForceRegression, PressRegression
 from tactomo_models.errors import CalibrationError, DataError
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scene.contacts import Contact
-from tactomo_models.sensor.description import SensorDescription
 
 SUFFIX: Final = ".taught.npz"
 FORMAT: Final = 1
+AGAIN: Final = "teach it again, or delete it"
 OTHER_SKIN: Final = 0.06
 """Rms of the logarithms of a reference's voltages over those of teaching, a common factor aside,
 from which the skin is another one, or damaged. Simulated: 0.02 where 10 K change a sheet unevenly,
@@ -144,16 +142,7 @@ def press_changes(
     return changes, weight > 0
 
 
-def taught_path(sensor: str) -> Path:
-    """Where what a sensor was taught is kept by default."""
-    return data_folder() / "calibrations" / f"{sensor}{SUFFIX}"
-
-
-def save_taught(taught: TaughtSkin, path: Path) -> None:
-    """Write what was taught; a half-written file is never left under that name.
-
-    Raises CalibrationError where the file cannot be written.
-    """
+def _write(taught: TaughtSkin, file: IO[bytes]) -> None:
     guess = np.zeros((0, 2)) if taught.guess_mm is None else taught.guess_mm
     arrays: dict[str, Any] = {
         "format": np.array(FORMAT),
@@ -172,29 +161,21 @@ def save_taught(taught: TaughtSkin, path: Path) -> None:
         "held_out_mm": np.array([taught.without_mm, taught.with_mm]),
         "reference": taught.reference,
     }
-    write_kept(path, lambda file: np.savez_compressed(file, **arrays))
+    np.savez_compressed(file, **arrays)
 
 
-def read_taught(path: Path) -> TaughtSkin:
-    """Read what was taught, whatever it is of.
-
-    Raises:
-        CalibrationError: it is damaged, of another format, or cannot be read.
-        FileNotFoundError: there is none.
-    """
-    again = "teach it again, or delete it"
+def _read(path: Path) -> TaughtSkin:
     try:
-        with reading(path, again):
-            arrays = read_arrays(path)
+        arrays = read_arrays(path)
         if int(arrays["format"]) != FORMAT:
             raise CalibrationError(
                 f"{path} is of format {int(arrays['format'])}, and this tactomo reads format "
-                f"{FORMAT}; {again}"
+                f"{FORMAT}; {AGAIN}"
             )
         taught = _of_arrays(arrays)
         _ = taught.regression, taught.forces  # now, not in the first frame
     except (DataError, KeyError, ValueError, ValidationError) as error:
-        raise CalibrationError(f"{path} is damaged, or nothing that was taught; {again}") from error
+        raise CalibrationError(f"{path} is damaged, or nothing that was taught; {AGAIN}") from error
     return taught
 
 
@@ -220,26 +201,4 @@ def _of_arrays(arrays: Mapping[str, Any]) -> TaughtSkin:
     )
 
 
-def load_taught(path: Path, sensor: str, description: SensorDescription) -> TaughtSkin:
-    """Read what was taught and make sure that it is of this sensor.
-
-    Raises:
-        CalibrationError: it is not, or see `read_taught`.
-        FileNotFoundError: there is none.
-    """
-    found = read_taught(path)
-    found.subject.check(path, description, f"run: tactomo teach live --sensor {sensor}", sensor)
-    return found
-
-
-def taught_of(description: SensorDescription, path: Path) -> TaughtSkin:
-    """Read what a sensor of such a description was taught, whatever its name.
-
-    Raises CalibrationError where there is none, or it is of another description; see `read_taught`.
-    """
-    try:
-        found = read_taught(path)
-    except FileNotFoundError as error:
-        raise CalibrationError(f"nothing was taught in {path}; give another path") from error
-    found.subject.check(path, description, "give the one of this sensor")
-    return found
+TAUGHT: Final = KeptFiles(SUFFIX, "teach", "nothing was taught in", AGAIN, _read, _write)

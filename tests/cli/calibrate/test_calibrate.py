@@ -14,7 +14,7 @@ from tactomo.running import Running, announced
 from tactomo_client import Contact, ControlError
 from tactomo_client.fake import FakeSensor
 from tactomo_models import SkinSimulator, load_description
-from tactomo_models.calibration.calibration_file import calibration_path, read_calibration
+from tactomo_models.calibration.calibration_file import CALIBRATIONS
 from tactomo_models.scene.press import Press
 from terminal import Terminal
 from waiting import repeated
@@ -42,7 +42,7 @@ CSV = "pressure_kpa,magnitude\n" + "".join(f"{kpa},{m:.4f}\n" for kpa, m in ROWS
 def test_a_table_of_magnitudes_is_fitted_kept_and_shown(tactomo: Run, tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text(CSV)
     tried = tactomo(*FIT, "--dry-run", status=0)
-    assert not calibration_path("palm").exists()
+    assert not CALIBRATIONS.path("palm").exists()
     assert "kept in" not in tried.stdout
     assert "disagrees" not in tried.stderr
     options = ("--picture", "curve.png", "--device-id", "skin-7f3a")
@@ -50,9 +50,9 @@ def test_a_table_of_magnitudes_is_fitted_kept_and_shown(tactomo: Run, tmp_path: 
     assert "palm: 8 readings of" in made.stdout
     assert "kPa contacts are `below` (touched, pressure unknown)" in made.stdout
     assert "beyond 220 kPa they are `above`" in made.stdout
-    assert f"kept in {calibration_path('palm')}" in made.stdout
+    assert f"kept in {CALIBRATIONS.path('palm')}" in made.stdout
     assert (tmp_path / "curve.png").stat().st_size > 10_000
-    kept = read_calibration(calibration_path("palm"))
+    kept = CALIBRATIONS.read(CALIBRATIONS.path("palm"))
     assert kept.subject.device_ids == ("skin-7f3a",)
     assert kept.curve.range_kpa == pytest.approx((120, 220), abs=4)
     assert kept.curve.pressure(np.array(0.12)) == pytest.approx(180, abs=1)
@@ -82,10 +82,10 @@ def test_a_table_with_a_slip_is_kept_on_request_alone(tactomo: Run, tmp_path: Pa
     words = (*FIT, "--picture", "curve.png")
     refused = tactomo(*words, status=1)
     assert "line 10 (220 kPa, |Δσ|/σ₀ 2.000)" in refused.stderr.splitlines()[-1]
-    assert not calibration_path("palm").exists()
+    assert not CALIBRATIONS.path("palm").exists()
     assert (tmp_path / "curve.png").exists()  # which shows the slip
     tactomo(*words, "--keep-odd", status=0)
-    assert read_calibration(calibration_path("palm")).subject.sensor == "palm"
+    assert CALIBRATIONS.read(CALIBRATIONS.path("palm")).subject.sensor == "palm"
 
 
 @pytest.mark.slow
@@ -137,7 +137,7 @@ def test_what_the_running_daemon_makes_of_it_is_told(
     with FakeControl(answers) as control, announced(Running("daemon", control.address, "palm")):
         made = tactomo(*FIT)
     assert made.returncode == 0, made.stderr
-    assert f"kept in {calibration_path('palm')}" in made.stdout
+    assert f"kept in {CALIBRATIONS.path('palm')}" in made.stdout
     assert said in made.stdout
     assert "in force now" not in made.stdout
 
@@ -164,11 +164,11 @@ def test_without_a_daemon_it_says_when_it_will_be_in_force(tactomo: Run, tmp_pat
     (tmp_path / "log.csv").write_text(CSV)
     for where in ((), ("--address", f"ipc://{tmp_path}/nobody"), ("--address", "nonsense")):
         made = tactomo(*FIT, *where, status=0)
-        assert f"kept in {calibration_path('palm')}" in made.stdout
+        assert f"kept in {CALIBRATIONS.path('palm')}" in made.stdout
         assert "not in force yet: " in made.stdout
         assert "tactomo calibrate reload" in made.stdout
     made = tactomo(*FIT, "-o", "elsewhere.json")
-    assert f"Copied to {calibration_path('palm')}" in made.stdout
+    assert f"Copied to {CALIBRATIONS.path('palm')}" in made.stdout
 
 
 def test_a_name_that_no_sensor_can_have(tactomo: Run, tmp_path: Path) -> None:
@@ -220,7 +220,7 @@ def test_a_recording_tells_what_the_sensor_showed(tactomo: Run, tmp_path: Path) 
     (tmp_path / "log.csv").write_text("time_s,force_n\n" + "".join(rows))
     options = ("--recording", "presses.mcap", "--diameter-mm", "30")
     tactomo(*FIT, *options, status=0)
-    kept = read_calibration(calibration_path("palm"))
+    kept = CALIBRATIONS.read(CALIBRATIONS.path("palm"))
     assert len(kept.readings) == 6
     assert kept.subject.device_ids
     knots = [130, 140, 200, 300], [0, 0.03, 0.25, 0.45]
@@ -279,7 +279,7 @@ def test_a_session_keeps_what_was_taken_and_goes_on(pressed: Pressed) -> None:
         "--area-mm2",
         "1000",
     )
-    log = calibration_path("palm").with_name("palm.readings.csv")
+    log = CALIBRATIONS.path("palm").with_name("palm.readings.csv")
     with Terminal(*command) as terminal:
         take(terminal, pressed, 1, *ROWS[0])
         terminal.wait_for("Still wanted: 10 more")
@@ -295,7 +295,7 @@ def test_a_session_keeps_what_was_taken_and_goes_on(pressed: Pressed) -> None:
         assert terminal.wait() == 1  # nothing that could be a curve
         assert "the magnitude channel does not answer to any" in terminal.shown
     assert len(log.read_text().splitlines()) == 2
-    assert not calibration_path("palm").exists()
+    assert not CALIBRATIONS.path("palm").exists()
     pressed.contacts = 1
     with Terminal(*command) as terminal:
         terminal.wait_for("Going on with 1 readings")
@@ -310,7 +310,7 @@ def test_a_session_keeps_what_was_taken_and_goes_on(pressed: Pressed) -> None:
         terminal.wait_for("dropped the reading at 2 kPa")
         terminal.press_ctrl_c()
         assert terminal.wait() == 0, terminal.shown
-    kept = read_calibration(calibration_path("palm"))
+    kept = CALIBRATIONS.read(CALIBRATIONS.path("palm"))
     taken = [(r.pressure_kpa, r.magnitude) for r in kept.readings]
     np.testing.assert_allclose(taken, ROWS, rtol=1e-6)
     assert [r.direction for r in kept.readings] == ["up"] * 5 + ["down"] * 3

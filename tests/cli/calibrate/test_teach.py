@@ -12,7 +12,7 @@ import pytest
 from fixture_types import Run
 from handmade_skin import presses, write_description
 from tactomo_models.archive import read_arrays
-from tactomo_models.calibration.taught_skin import read_taught, taught_path
+from tactomo_models.calibration.taught_skin import TAUGHT
 
 Arrays = dict[str, Any]
 
@@ -46,14 +46,14 @@ def errors_mm(tactomo: Run, folder: Path, *options: Any) -> tuple[np.ndarray, di
 def test_a_taught_skin_is_located_better(tactomo: Run, tmp_path: Path) -> None:
     made = teach(tactomo, tmp_path, presses(30, seed=1))
     assert "palm: 30 presses of" in made.stdout
-    assert f"kept in {taught_path('palm')}" in made.stdout
+    assert f"kept in {TAUGHT.path('palm')}" in made.stdout
     shown = tactomo("teach", "show", "--sensor", "palm")
     assert shown.stdout.splitlines()[:2] == made.stdout.splitlines()[:2]
-    kept = read_taught(taught_path("palm"))
+    kept = TAUGHT.read(TAUGHT.path("palm"))
     assert kept.with_mm < kept.without_mm
     untaught, maps = errors_mm(tactomo, tmp_path)
     assert not maps["contact_taught"].any()
-    taught, maps = errors_mm(tactomo, tmp_path, "--taught", taught_path("palm"))
+    taught, maps = errors_mm(tactomo, tmp_path, "--taught", TAUGHT.path("palm"))
     assert maps["contact_taught"].mean() > 0.9
     assert np.median(taught) < 0.75 * np.median(untaught)
     sigma = maps["contact_x_sigma_mm"][maps["contact_taught"]]
@@ -75,7 +75,7 @@ def test_forces_are_taught_where_they_are_known(tactomo: Run, tmp_path: Path, go
 
     untaught, _ = off()
     assert np.nanmedian(untaught) < -0.15
-    taught, in_sigmas = off("--taught", taught_path("palm"))
+    taught, in_sigmas = off("--taught", TAUGHT.path("palm"))
     assert np.median(np.abs(taught)) < 0.04
     assert 0.4 < (np.abs(in_sigmas) < 1).mean() < 0.95
 
@@ -93,7 +93,7 @@ def test_forces_that_say_nothing_are_not_learnt(tactomo: Run, tmp_path: Path, go
         made = teach(tactomo, tmp_path, changed(good, force_n=force_n))
         assert re.search(f"forces are not learnt: {why}", made.stderr)
         assert "forces to" not in made.stdout
-        assert read_taught(taught_path("palm")).forces is None
+        assert TAUGHT.read(TAUGHT.path("palm")).forces is None
 
 
 @pytest.mark.slow
@@ -105,7 +105,7 @@ def test_where_nothing_was_taught_the_frame_says_so(
     some = {k: v[left] if len(v) == len(left) else v for k, v in good.items()}
     teach(tactomo, tmp_path, some)
     _, before = errors_mm(tactomo, tmp_path)
-    _, maps = errors_mm(tactomo, tmp_path, "--taught", taught_path("palm"))
+    _, maps = errors_mm(tactomo, tmp_path, "--taught", TAUGHT.path("palm"))
     far = presses(20, seed=2)["xy_mm"][maps["contact_frame"], 0] > 40
     assert far.any()
     assert not maps["contact_taught"][far].any()
@@ -165,7 +165,7 @@ def test_bad_presses_are_named_and_not_kept(
 ) -> None:
     result = teach(tactomo, tmp_path, spoil(good), status=1)
     assert told in result.stderr
-    assert not taught_path("palm").exists()
+    assert not TAUGHT.path("palm").exists()
 
 
 @pytest.mark.slow
@@ -177,7 +177,7 @@ def test_presses_that_teach_nothing_are_not_kept(
     spoilt = changed(good, xy_mm=good["xy_mm"] + off)
     result = teach(tactomo, tmp_path, spoilt, "--keep-odd", status=1)
     assert "nothing is kept: of 60 presses" in result.stderr
-    assert not taught_path("palm").exists()
+    assert not TAUGHT.path("palm").exists()
 
 
 @pytest.mark.slow
@@ -186,7 +186,7 @@ def test_another_skin_is_refused(tactomo: Run, tmp_path: Path, good: Arrays) -> 
     np.savez(tmp_path / "other.npz", **presses(3, seed=3, skin=5))
     result = tactomo(
         *("reconstruct", tmp_path / "other.npz", tmp_path / "maps.npz"),
-        *("-d", tmp_path / "skin.toml", "--taught", taught_path("palm")),
+        *("-d", tmp_path / "skin.toml", "--taught", TAUGHT.path("palm")),
         status=1,
     )
     assert "does not fit this skin" in result.stderr
@@ -196,7 +196,7 @@ def test_another_skin_is_refused(tactomo: Run, tmp_path: Path, good: Arrays) -> 
 def test_a_damaged_file_is_told(tactomo: Run, tmp_path: Path) -> None:
     result = tactomo("teach", "show", "--sensor", "palm")
     assert (result.returncode, "tactomo teach live --sensor palm" in result.stderr) == (1, True)
-    path = taught_path("palm")
+    path = TAUGHT.path("palm")
     path.parent.mkdir(parents=True)
     path.write_bytes(b"PK")
     result = tactomo("teach", "show", "--sensor", "palm", status=1)

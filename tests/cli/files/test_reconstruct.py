@@ -11,11 +11,7 @@ import pytest
 from fixture_types import Run
 from tactomo.cli import app
 from tactomo_models import Flag, Press, SkinSimulator, available_methods, load_description
-from tactomo_models.calibration.calibration_file import (
-    PressureCalibration,
-    Subject,
-    save_calibration,
-)
+from tactomo_models.calibration.calibration_file import CALIBRATIONS, PressureCalibration, Subject
 from tactomo_models.calibration.curve import Reading
 from tactomo_models.growing_arrays import GrowingArrays
 from tactomo_protocol import Channel
@@ -114,7 +110,7 @@ def test_a_calibration_says_how_hard_is_pressed(tactomo: Run, tmp_path: Path) ->
     ]
     subject = Subject(sensor="left", description=sensor.name, sha256=sensor.sha256)
     made = PressureCalibration.of_readings(subject, readings)
-    save_calibration(made, tmp_path / "left.pressure.json")
+    CALIBRATIONS.save(made, tmp_path / "left.pressure.json")
     options = ("--calibration", "left.pressure.json")
     tactomo("reconstruct", "in.npz", "out.npz", *options, status=0)
     with np.load(tmp_path / "out.npz") as maps:  # 180 kPa change it by 0.177

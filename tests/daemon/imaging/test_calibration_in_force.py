@@ -19,14 +19,9 @@ from tactomo.recordings.recording import open_recording
 from tactomo.service.daemon import Daemon
 from tactomo_client import CalibrationRefused, request
 from tactomo_models import CalibrationError, load_description
-from tactomo_models.calibration.calibration_file import (
-    PressureCalibration,
-    Subject,
-    calibration_path,
-    save_calibration,
-)
+from tactomo_models.calibration.calibration_file import CALIBRATIONS, PressureCalibration, Subject
 from tactomo_models.calibration.curve import Reading
-from tactomo_models.calibration.taught_skin import TaughtSkin, save_taught, taught_path
+from tactomo_models.calibration.taught_skin import TAUGHT, TaughtSkin
 
 SENSOR = load_description("paper_square")
 SUBJECT = Subject(sensor="left", description=SENSOR.name, sha256=SENSOR.sha256)
@@ -42,7 +37,7 @@ def kept(path: Path | None = None, factor: float = 1.0, **changes: Any) -> Press
     subject = SUBJECT.model_copy(update=changes)
     readings = [r.model_copy(update={"pressure_kpa": factor * r.pressure_kpa}) for r in READINGS]
     made = PressureCalibration.of_readings(subject, readings)
-    save_calibration(made, path or calibration_path("left"))
+    CALIBRATIONS.save(made, path or CALIBRATIONS.path("left"))
     return made
 
 
@@ -81,7 +76,7 @@ def test_one_that_is_asked_for_must_be_there(bench: Start, tmp_path: Path) -> No
 
 def test_a_damaged_one_is_told_and_not_used(bench: Start) -> None:
     kept()
-    path = calibration_path("left")
+    path = CALIBRATIONS.path("left")
     path.write_text(path.read_text().replace('"format": 1', '"format": 2'))
     (trouble,) = bench().ask("status")["events"]["troubles"]
     assert "is of format 2, and this tactomo reads format 1" in trouble["detail"]
@@ -112,7 +107,7 @@ def test_a_recording_takes_it_along(bench: Start, replay: Start, tmp_path: Path)
     daemon = bench(recording={"file": tmp_path / "press.mcap"}).tare()
     daemon.step(load=0.5)
     daemon.ask("record_stop")
-    calibration_path("left").unlink()
+    CALIBRATIONS.path("left").unlink()
     recording = open_recording(tmp_path / "press.mcap")
     assert '"pressure_kpa"' in recording.origin.calibration
     again = open_recording(replay(recording.path).path)
@@ -138,7 +133,7 @@ def test_a_new_one_is_in_force_at_once_and_one_that_was_deleted_no_more(bench: S
         daemon.listener.wait(
             "event", lambda e, made=made: (e["name"], e["detail"]) == (RELOADED, made.words)
         )
-    calibration_path("left").unlink()
+    CALIBRATIONS.path("left").unlink()
     assert daemon.ask("reload_calibration") == {"calibration": None, "taught": None}
     assert in_force() == (None, 300)
     daemon.listener.wait("event", lambda e: "pressures are the description's" in e["detail"])
@@ -154,7 +149,7 @@ def test_one_that_cannot_be_used_leaves_the_one_in_force(bench: Start) -> None:
         (None, "is damaged"),
     ):
         if changes is None:
-            calibration_path("left").write_text("{")
+            CALIBRATIONS.path("left").write_text("{")
         else:
             kept(**changes)
         with pytest.raises(CalibrationRefused, match="what was in force stays so") as refusal:
@@ -202,7 +197,7 @@ class Pressed:
     def reload(self, factor: float | None) -> None:
         """Have another calibration read, or have it seen that there is none."""
         if factor is None:
-            calibration_path("left").unlink()
+            CALIBRATIONS.path("left").unlink()
         else:
             kept(factor=factor)
         self.bench.ask("reload_calibration")
@@ -246,7 +241,7 @@ def test_a_replay_goes_by_each_calibration_from_its_frame_on(
     again = replay(path)
     assert pressures(again.of("contacts")) == live
     assert pressures(replay(again.path).of("contacts")) == live
-    by_one = pressures(replay(path, calibration=calibration_path("left")).of("contacts"))
+    by_one = pressures(replay(path, calibration=CALIBRATIONS.path("left")).of("contacts"))
     assert min(kpa for (kpa,) in by_one.values()) > 2 * described
 
 
@@ -327,7 +322,7 @@ def taught(**changes: Any) -> TaughtSkin:
         "reference": np.stack([REST, REST]),
     }
     made = TaughtSkin(**{**fields, **changes})
-    save_taught(made, taught_path("left"))
+    TAUGHT.save(made, TAUGHT.path("left"))
     return made
 
 
@@ -340,7 +335,7 @@ def test_what_was_taught_is_found_by_the_sensors_name_and_told(bench: Start) -> 
         **{"taken": made.taken, "presses": 40},
         **{"median_mm": 0.2, "untaught_median_mm": 1.4},
     }
-    taught_path("left").unlink()
+    TAUGHT.path("left").unlink()
     assert daemon.ask("reload_calibration")["taught"] is None
     assert daemon.ask("status")["description"]["taught"] is None
     again = taught(taken="2026-02-01T12:00:00+00:00")
@@ -374,7 +369,7 @@ def test_what_was_taught_on_another_skin_is_not_used(
 ) -> None:
     taught(**(changes or {}))
     if changes is None:
-        taught_path("left").write_bytes(b"PK")
+        TAUGHT.path("left").write_bytes(b"PK")
     daemon = bench().tare()
     status = daemon.ask("status")
     (trouble,) = status["events"]["troubles"]

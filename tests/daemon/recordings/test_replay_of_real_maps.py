@@ -12,9 +12,8 @@ from tactomo.recordings.recording import open_recording
 from tactomo_client.messages import array_from_wire
 from tactomo_models import Press, SensorDescription, SkinSimulator, load_description
 from tactomo_models.calibration.calibration_file import (
+    CALIBRATIONS,
     PressureCalibration,
-    calibration_path,
-    save_calibration,
     subject_of,
 )
 from tactomo_models.calibration.curve import Reading
@@ -53,7 +52,7 @@ def test_the_replay_of_a_pressed_skin_gives_the_same_maps(
     assert [c["id"] for c in before["contacts"]] == [c["id"] for c in after["contacts"]] != []
     for step in range(4):
         press(Press(-0.03 + 0.004 * step, 0.02, 180.0))
-    save_calibration(a_calibration("left", sensor), calibration_path("left"))
+    CALIBRATIONS.save(a_calibration("left", sensor), CALIBRATIONS.path("left"))
     told = b.ask("reload_calibration")["calibration"]
     pressed = press(Press(-0.014, 0.02, 180.0), Press(0.04, -0.03, 190.0))
     press(Press(-0.014, 0.02, 180.0), channels=(Channel.MAGNITUDE,))  # the last shape is held

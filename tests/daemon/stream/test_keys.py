@@ -41,8 +41,8 @@ from tactomo_client import Daemon as Commander
 from tactomo_client.keys import read_public, read_secret
 from tactomo_models import load_description
 from tactomo_models.calibration.calibration_file import (
+    CALIBRATIONS,
     PressureCalibration,
-    calibration_path,
     subject_of,
 )
 from tactomo_models.calibration.curve import Reading
@@ -244,13 +244,13 @@ def test_a_reader_is_told_who_can_put_a_calibration_in_force(
     sensor = load_description("paper_square")
     readings = [Reading(pressure_kpa=k, magnitude=(k - 140) * 2e-3) for k in range(150, 241, 10)]
     made = PressureCalibration.of_readings(subject_of("left", sensor), readings)
-    path = calibration_path("left")
+    path = CALIBRATIONS.path("left")
     reader = robot.allow(robot.client("reader"))
-    told = reload.taken_up(made, path, guarded.daemon.stream_address, reader)
+    told = reload.taken_up(CALIBRATIONS, made, path, guarded.daemon.stream_address, reader)
     assert told.startswith("not in force yet: ")
     assert "calibrate reload --sensor left" in told
     commander = robot.allow(robot.client("chief"), may_command=True)
-    told = reload.taken_up(made, path, guarded.daemon.stream_address, commander)
+    told = reload.taken_up(CALIBRATIONS, made, path, guarded.daemon.stream_address, commander)
     assert "the description's table" in told
 
 

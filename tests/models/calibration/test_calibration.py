@@ -14,13 +14,10 @@ from hypothesis import strategies as st
 from tactomo_models import CalibrationError, SensorDescription
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.calibration.calibration_file import (
+    CALIBRATIONS,
     PressureCalibration,
     Subject,
     calibration_for,
-    calibration_path,
-    load_calibration,
-    read_calibration,
-    save_calibration,
 )
 from tactomo_models.calibration.curve import Reading, directions_of, fit_curve, still_wanted
 from tactomo_models.scene.pressure import pressures_of
@@ -198,7 +195,7 @@ def made(subject: Subject) -> PressureCalibration:
 
 def test_what_is_kept_is_found_again(small: SensorDescription, made: PressureCalibration) -> None:
     assert calibration_for("left", small, None, pytest.fail) is None
-    save_calibration(made, calibration_path("left"))
+    CALIBRATIONS.save(made, CALIBRATIONS.path("left"))
     found = calibration_for("left", small, None, pytest.fail)
     assert found == made
     assert found is not None
@@ -209,7 +206,7 @@ def test_what_is_kept_is_found_again(small: SensorDescription, made: PressureCal
 def test_one_beside_the_description_is_found_too(
     small: SensorDescription, made: PressureCalibration, tmp_path: Path
 ) -> None:
-    save_calibration(made, tmp_path / "sheet.pressure.json")
+    CALIBRATIONS.save(made, tmp_path / "sheet.pressure.json")
     source = tmp_path / "sheet.toml"
     assert calibration_for("left", small, source, pytest.fail) == made
     told: list[str] = []
@@ -242,23 +239,23 @@ def test_a_damaged_file_is_refused(
         value = [*numbers[:-1], 1e308]
     path.write_text(json.dumps({**made.model_dump(), key: value}))
     with pytest.raises(CalibrationError, match=said):
-        read_calibration(path)
+        CALIBRATIONS.read(path)
 
 
 def test_what_cannot_be_read_or_written_is_told(
     small: SensorDescription, made: PressureCalibration, tmp_path: Path
 ) -> None:
     with pytest.raises(CalibrationError, match=r"cannot read .*: it is no regular file; put"):
-        load_calibration(tmp_path, "left", small)
+        CALIBRATIONS.load(tmp_path, "left", small)
     (tmp_path / "file").touch()
     with pytest.raises(CalibrationError, match="cannot write"):
-        save_calibration(made, tmp_path / "file" / "left.pressure.json")
+        CALIBRATIONS.save(made, tmp_path / "file" / "left.pressure.json")
 
 
 def test_a_pipe_in_a_calibrations_place_is_refused_and_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "left.pressure.json")
     with pytest.raises(CalibrationError, match="no regular file"):
-        read_calibration(tmp_path / "left.pressure.json")
+        CALIBRATIONS.read(tmp_path / "left.pressure.json")
 
 
 def test_foreign_devices_are_named(subject: Subject) -> None:

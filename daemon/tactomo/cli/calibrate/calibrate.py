@@ -75,18 +75,18 @@ def live(
     continues later.
     """
     from tactomo_client.control import to_status
-    from tactomo_models.calibration.calibration_file import calibration_path
+    from tactomo_models.calibration.calibration_file import CALIBRATIONS
 
     from tactomo.cli.calibrate.live import guided
     from tactomo.cli.calibrate.reload import keep
 
     found = find_sensor(sensor, address, keys)
     status = to_status(newest_status(found.sensor, address, keys))
-    path = output or calibration_path(found.sensor)
+    path = output or CALIBRATIONS.path(found.sensor)
     area = _area_mm2(diameter_mm, area_mm2)
     made = guided(status, found.stream, keys, area, path, fresh=fresh)
     print_calibration(made)
-    keep(made, path, address, keys)
+    keep(CALIBRATIONS, made, path, address, keys)
 
 
 @app.command(
@@ -135,20 +135,20 @@ def fit(
     if not math.isfinite(time_offset):
         raise typer.BadParameter(f"--time-offset {time_offset}: give seconds")
     area = _area_mm2(diameter_mm, area_mm2)
-    from tactomo_models.calibration.calibration_file import calibration_path
+    from tactomo_models.calibration.calibration_file import CALIBRATIONS
 
     from tactomo.cli.calibrate.fit import fitted
     from tactomo.cli.calibrate.reload import keep
 
     name = name_of(sensor)
-    path = output or calibration_path(name)
+    path = output or CALIBRATIONS.path(name)
     made, odd = fitted(
         name, readings, recording, area, time_offset, description, tuple(device_id or ())
     )
     print_calibration(made)
     is_refused = bool(odd) and not keep_odd
     if not (dry_run or is_refused):
-        keep(made, path, address, keys)
+        keep(CALIBRATIONS, made, path, address, keys)
     _draw(made, picture)
     if is_refused and not dry_run:
         from tactomo_models import CalibrationError
@@ -172,17 +172,10 @@ def show(
     picture: Picture = None,
 ) -> None:
     """Show a sensor's calibration: curve, uncertainty and readings."""
-    from tactomo_models import CalibrationError
-    from tactomo_models.calibration.calibration_file import calibration_path, read_calibration
+    from tactomo_models.calibration.calibration_file import CALIBRATIONS
 
     name = name_of(sensor)
-    path = file or calibration_path(name)
-    try:
-        made = read_calibration(path)
-    except FileNotFoundError as error:
-        raise CalibrationError(
-            f"there is no calibration {path}; run: tactomo calibrate live --sensor {name}"
-        ) from error
+    made = CALIBRATIONS.read(file or CALIBRATIONS.path(name), CALIBRATIONS.again(name))
     print_calibration(made)
     _draw(made, picture)
 

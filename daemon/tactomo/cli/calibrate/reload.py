@@ -14,8 +14,7 @@ from tactomo.cli.sensors import SensorError, find_commanded, find_control
 
 if TYPE_CHECKING:
     from tactomo_client import CalibrationInForce
-    from tactomo_models.calibration.calibration_file import PressureCalibration
-    from tactomo_models.calibration.taught_skin import TaughtSkin
+    from tactomo_models.calibration.calibration_file import Kept, KeptFiles, Made
 
 
 CONNECT_S: Final = 1.0  # how long to wait where nobody listens: there need not be a daemon
@@ -29,30 +28,22 @@ def reload_kept(name: str | None, address: str | None, keys: Path | None) -> str
 
 
 def keep(
-    made: PressureCalibration | TaughtSkin, path: Path, address: str | None, keys: Path | None
+    files: KeptFiles[Made], made: Made, path: Path, address: str | None, keys: Path | None
 ) -> None:
     """Write what was made into a file, and have its sensor's daemon go by it, if that runs."""
-    from tactomo_models.calibration.calibration_file import PressureCalibration, save_calibration
-    from tactomo_models.calibration.taught_skin import save_taught
-
-    if isinstance(made, PressureCalibration):
-        save_calibration(made, path)
-    else:
-        save_taught(made, path)
+    files.save(made, path)
     say(f"kept in {path}")
-    say(taken_up(made, path, address, keys))
+    say(taken_up(files, made, path, address, keys))
 
 
 def taken_up(
-    made: PressureCalibration | TaughtSkin, path: Path, address: str | None, keys: Path | None
+    files: KeptFiles[Made], made: Made, path: Path, address: str | None, keys: Path | None
 ) -> str:
     """Have the sensor's daemon, if it runs, use what was kept; say in words what became of it."""
     from tactomo_client import CalibrationRefused, ClientError, KeysError
-    from tactomo_models.calibration.calibration_file import PressureCalibration, calibration_path
-    from tactomo_models.calibration.taught_skin import taught_path
 
     sensor = made.subject.sensor
-    own = (calibration_path if isinstance(made, PressureCalibration) else taught_path)(sensor)
+    own = files.path(sensor)
     again = f"tactomo calibrate reload --sensor {sensor}"
     try:
         found = _reloaded(find_control(sensor, address, keys), keys)
@@ -83,7 +74,7 @@ def _reloaded(control: str, keys: Path | None) -> CalibrationInForce:
         return daemon.reload_calibration()
 
 
-def _is_in_force(made: PressureCalibration | TaughtSkin, found: CalibrationInForce) -> bool:
+def _is_in_force(made: Kept, found: CalibrationInForce) -> bool:
     from tactomo_models.calibration.calibration_file import PressureCalibration
 
     if not isinstance(made, PressureCalibration):

@@ -64,12 +64,12 @@ def live(
     The command says where to press, listens for a second while you hold the press, and learns at
     the end. Each press is stored at once; the same command continues later.
     """
-    from tactomo_models.calibration.taught_skin import taught_path
+    from tactomo_models.calibration.taught_skin import TAUGHT
 
     from tactomo.cli.calibrate.teach_live import guided
 
     found = find_sensor(sensor, address, keys)
-    path = output or taught_path(found.sensor)
+    path = output or TAUGHT.path(found.sensor)
     file = presses or path.with_name(f"{found.sensor}.presses.npz")
     sensor_description, subject = guided(found.sensor, found.stream, keys, description, file)
     _teach(file, sensor_description, subject, path, address, keys, keep_odd=keep_odd)
@@ -105,11 +105,11 @@ def fit(
     """
     from tactomo_models import load_description
     from tactomo_models.calibration.calibration_file import Subject
-    from tactomo_models.calibration.taught_skin import taught_path
+    from tactomo_models.calibration.taught_skin import TAUGHT
 
     known, name = load_description(description), name_of(sensor)
     subject = Subject.of(name, known, device_id or ())
-    path = None if dry_run else output or taught_path(name)
+    path = None if dry_run else output or TAUGHT.path(name)
     _teach(presses, known, subject, path, address, keys, keep_odd=keep_odd)
 
 
@@ -119,17 +119,10 @@ def show(
     sensor: options.Sensor = None,
 ) -> None:
     """Show a skin's taught model: its presses and its errors."""
-    from tactomo_models import CalibrationError
-    from tactomo_models.calibration.taught_skin import read_taught, taught_path
+    from tactomo_models.calibration.taught_skin import TAUGHT
 
     name = name_of(sensor)
-    path = file or taught_path(name)
-    try:
-        _print(read_taught(path))
-    except FileNotFoundError as error:
-        raise CalibrationError(
-            f"nothing was taught in {path}; run: tactomo teach live --sensor {name}"
-        ) from error
+    _print(TAUGHT.read(file or TAUGHT.path(name), TAUGHT.again(name)))
 
 
 def _teach(
@@ -143,6 +136,7 @@ def _teach(
     keep_odd: bool,
 ) -> None:
     """Learn from a file, keep what is learnt in `path`, if any, and have the daemon use it."""
+    from tactomo_models.calibration.taught_skin import TAUGHT
     from tactomo_models.commissioning.teach import read_presses, teach
 
     from tactomo.cli.calibrate.reload import keep
@@ -154,7 +148,7 @@ def _teach(
         say(note, err=True)
     _print(taught)
     if path is not None:
-        keep(taught, path, address, keys)
+        keep(TAUGHT, taught, path, address, keys)
 
 
 def _print(taught: TaughtSkin) -> None:

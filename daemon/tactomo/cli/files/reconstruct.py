@@ -108,8 +108,8 @@ def reconstruct(
     """
     from tactomo_models import load_description
     from tactomo_models.batch import ReferencedScans, reconstruct_file, reference_at_rest
-    from tactomo_models.calibration.calibration_file import calibration_of
-    from tactomo_models.calibration.taught_skin import taught_of
+    from tactomo_models.calibration.calibration_file import CALIBRATIONS
+    from tactomo_models.calibration.taught_skin import TAUGHT
     from tactomo_models.sensor.named_pattern import NamedPattern
     from tactomo_protocol import Channel
 
@@ -120,8 +120,8 @@ def reconstruct(
     named = None if pattern is None else NamedPattern.of_name(pattern)
     if named is not None:
         sensor = named.applied(sensor)
-    curve = None if calibration is None else calibration_of(sensor, calibration).curve
-    lesson = None if taught is None else taught_of(sensor, taught)
+    curve = None if calibration is None else CALIBRATIONS.of(sensor, calibration).curve
+    lesson = None if taught is None else TAUGHT.of(sensor, taught)
     one = None if channel is None else Channel(channel)
     frames_at_rest = frame_slice(reference_frames)
     unpressed = None if rest is None else read_scans(rest, sensor, one, pattern=named)
