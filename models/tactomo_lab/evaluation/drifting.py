@@ -16,13 +16,13 @@ import numpy as np
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scene.press import Press
 from tactomo_models.sensor.description import SensorDescription
-from tactomo_models.simulation.simulator import SkinSimulator
+from tactomo_models.simulation.simulator import SkinSimulator, noisy
 from tactomo_models.simulation.skin_drift import DriftingSkin, SkinDrift
 from tactomo_protocol import Channel
 
 from tactomo_lab.scenes.case import REFERENCE_SCANS, Case, Frame, as_described
 from tactomo_lab.scenes.drawing import SeedSet, require_channels, seed_of
-from tactomo_lab.scenes.simulation import IMPEDANCE_DEVIATION, UNEVENNESS, Volts
+from tactomo_lab.scenes.simulation import IMPEDANCE_DEVIATION, UNEVENNESS
 
 DRIFT: Final = SkinDrift(swing_k=10.0, creep=0.01, impedance=0.1)
 STEP_K: Final = 2.0  # somebody opens a window ...
@@ -109,20 +109,13 @@ def draw_day(
     rng = np.random.default_rng(seed_of(seed_set, "drift noise", number))
     rest = simulator.voltages([])
     noise_v = {name: NOISE_SHARE * np.abs(volts).max() for name, volts in rest.items()}
-
-    def scans(volts: Volts, *count: int) -> Volts:
-        return {
-            name: v + noise_v[name] * rng.standard_normal((*count, len(v)))
-            for name, v in volts.items()
-        }
-
-    tare = Reference.from_scans(*map(scans(rest, REFERENCE_SCANS).get, Channel))
+    tare = Reference.from_scans(*map(noisy(rest, noise_v, rng, REFERENCE_SCANS).get, Channel))
     skin, frames = DriftingSkin(simulator, seed=seed), []
     for time_s in _times_s(presses, hours, is_followed):
         after_s = max(0.0, time_s - step_at_s)
         skin.drift = replace(DRIFT, step_k=STEP_K * float(-np.expm1(-after_s / STEP_S)))
         there = [each.press for each in presses if each.start_s <= time_s < each.end_s]
-        volts = scans(skin.voltages(there, time_s))
+        volts = noisy(skin.voltages(there, time_s), noise_v, rng)
         frames.append(Frame(dict(zip("A", there, strict=False)), volts, time_s=time_s))
     plan = as_described(description, *(tuple(frame.presses.values()) for frame in frames))
     return Case(seed_set, number, plan, description, description, tare, frames, is_followed)

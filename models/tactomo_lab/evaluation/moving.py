@@ -24,6 +24,7 @@ from tactomo_models.errors import DataError
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scene.press import Press
 from tactomo_models.sensor.description import SensorDescription
+from tactomo_models.simulation.simulator import noisy
 from tactomo_protocol import Channel
 
 from tactomo_lab.evaluation.regimes import (
@@ -41,7 +42,7 @@ from tactomo_lab.scenes.case import (
     Frame,
     Plan,
     Simulated,
-    noise_std,
+    noise_stds,
     simulate,
 )
 from tactomo_lab.scenes.drawing import (
@@ -164,9 +165,7 @@ def draw_sequence(description: SensorDescription, seed_set: SeedSet, number: int
     under_load = np.array([bool(step.presses) for step in steps])
     pressed = {name: scans[under_load] for name, scans in simulated.volts.pressed.items()}
     loaded = replace(simulated.volts, pressed=pressed)
-    noise = {
-        name: noise_std(loaded, name, plan.snr_db, plan.snr_of) for name in description.channels
-    }
+    noise = noise_stds(loaded, plan.snr_db, plan.snr_of)
     seed = seed_of(seed_set, "moving noise", number)
     return follow(simulated, steps, noise, np.random.default_rng(seed), seed_set, number)
 
@@ -254,16 +253,11 @@ def follow(
 
     def tare() -> Reference:
         if all(isinstance(std, float) for std in noise.values()):
-            rest = {
-                name: at_rest + noise[name] * rng.standard_normal((REFERENCE_SCANS, len(at_rest)))
-                for name, at_rest in volts.rest.items()
-            }
+            rest = noisy(volts.rest, noise, rng, REFERENCE_SCANS)
             return Reference.from_scans(*map(rest.get, Channel))
         # One scan at rest, as `batch` takes it, does not tell the noise: the others do.
-        seen = {
-            name: scans + np.reshape(noise[name], (-1, 1)) * rng.standard_normal(scans.shape)
-            for name, scans in volts.pressed.items()
-        }
+        each = {name: np.reshape(std, (-1, 1)) for name, std in noise.items()}
+        seen = noisy(volts.pressed, each, rng, len(steps))
         one = Reference(volts.rest.get(Channel.MAGNITUDE), volts.rest.get(Channel.STRUCTURE))
         return one.with_noise_of(simulated.told, *map(seen.get, Channel))
 
@@ -271,10 +265,9 @@ def follow(
     frames = []
     for index, step in enumerate(steps):
         anew = tare() if step.tare else None
-        scans = {}
-        for name, pressed in volts.pressed.items():
-            std = np.broadcast_to(noise[name], len(steps))[index]
-            scans[name] = pressed[index] + std * rng.standard_normal(len(volts.rest[name]))
+        now = {name: pressed[index] for name, pressed in volts.pressed.items()}
+        std = {name: np.broadcast_to(each, len(steps))[index] for name, each in noise.items()}
+        scans = noisy(now, std, rng)
         kept = {name: scan for name, scan in scans.items() if name not in step.lost}
         time_s = index * (period_s or 0.0)
         frames.append(Frame(step.presses, kept, step.phase, anew, time_s, step.countable))
@@ -320,13 +313,13 @@ def mixed_sequence(
     plan = by_hand_as_told(draw, *_frames(steps))
     skin = seed_of(seed_set, "stability mixed-moving sheet", number)
     simulated = simulate(description, plan, skin)
-    noise: dict[Channel, float | FloatArray] = {}
-    for name in description.channels:
-        noise[name] = noise_std(simulated.volts, name, CONVERTER_DB, "voltage")
-        if noise_of == "each change":
-            change = simulated.volts.pressed[name] - simulated.volts.rest[name]
-            share = 10 ** (-NOISE_DB[noise_of] / 20)
-            noise[name] = np.asarray(np.sqrt(np.mean(change**2, axis=1)) * share)
+    noise: Mapping[Channel, float | FloatArray] = noise_stds(
+        simulated.volts, CONVERTER_DB, "voltage"
+    )
+    if noise_of == "each change":
+        share = 10 ** (-NOISE_DB[noise_of] / 20)
+        changes = {n: v - simulated.volts.rest[n] for n, v in simulated.volts.pressed.items()}
+        noise = {n: np.sqrt(np.mean(v**2, axis=1)) * share for n, v in changes.items()}
     simulated = replace(simulated, plan=replace(plan, snr_db=NOISE_DB[noise_of]))
     seed = seed_of(seed_set, f"mixed-moving noise {noise_of}", number)
     return follow(simulated, steps, noise, np.random.default_rng(seed), seed_set, number)
@@ -342,10 +335,7 @@ def palm_sequence(description: SensorDescription, seed_set: SeedSet, number: int
     steps = [_palm_step(presses) for presses in plan.frames]
     rng = np.random.default_rng(seed_of(seed_set, "palm seconds", number))
     period_s = float(np.exp(rng.uniform(*np.log(PALM_S)))) / PALM_FRAMES
-    noise = {
-        name: noise_std(simulated.volts, name, plan.snr_db, plan.snr_of)
-        for name in description.channels
-    }
+    noise = noise_stds(simulated.volts, plan.snr_db, plan.snr_of)
     seed = seed_of(seed_set, "palm noise", number)
     return follow(simulated, steps, noise, np.random.default_rng(seed), seed_set, number, period_s)
 

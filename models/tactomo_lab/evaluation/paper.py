@@ -26,6 +26,7 @@ from tactomo_models.scans.reference import Reference
 from tactomo_models.scene.contacts import Contact
 from tactomo_models.scene.press import Press
 from tactomo_models.sensor.description import SensorDescription
+from tactomo_models.simulation.simulator import noisy
 from tactomo_protocol import Channel
 
 from tactomo_lab.evaluation.play import Outcome
@@ -36,10 +37,10 @@ from tactomo_lab.scenes.case import (
     Plan,
     Simulated,
     as_described,
-    noise_std,
+    noise_stds,
     simulate,
 )
-from tactomo_lab.scenes.drawing import BOTH_CHANNELS, SeedSet, require_channels, seed_of
+from tactomo_lab.scenes.drawing import SeedSet, require_channels, seed_of
 from tactomo_lab.scenes.measures import Score, Summary, full_range, summarise
 from tactomo_lab.scenes.presets import PAPER_CONTACTS, PAPER_CONTRAST, paper_presses
 from tactomo_lab.scenes.simulation import Volts
@@ -155,17 +156,12 @@ def pressed_in_turn(
         return simulate(description, plan, seed_of(seed_set, "paper sheet", sheet))
 
     bare = simulated()
-    noise_v = {
-        name: noise_std(bare.volts, name, PRESSED_SNR_DB, "voltage") for name in BOTH_CHANNELS
-    }
+    noise_v = noise_stds(bare.volts, PRESSED_SNR_DB, "voltage")
 
     def scans(made: Simulated, count: int) -> Volts:
         (presses,) = made.plan.frames
         rng = np.random.default_rng(seed_of(seed_set, f"paper noise {presses}", sheet))
-        return {
-            name: volts + noise_v[name] * rng.standard_normal((count, volts.shape[-1]))
-            for name, volts in made.volts.pressed.items()
-        }
+        return noisy(made.volts.pressed, noise_v, rng, count)
 
     tare = Reference.from_scans(*scans(bare, REFERENCE_SCANS).values())
     for press in presses:

@@ -70,7 +70,7 @@ class Plan:
     opposite: bool  # whether the magnitude channel changes against the description's sign
     shape: str = ""  # of all indenters, or "mixed"; what they are, where empty
     sign_told: bool = True  # whether the reconstructor knows of `opposite`
-    snr_db: float = 40.0  # signal-to-noise ratio, and `snr_of` what; see `noise_std`
+    snr_db: float = 40.0  # signal-to-noise ratio, and `snr_of` what; see `noise_stds`
     snr_of: SnrOf = "change"
     # the sheets that `tared`, `later` and `lead` are about
     at_fault: tuple[Channel, ...] = BOTH_CHANNELS
@@ -244,8 +244,8 @@ def with_companion(case: Case, relative_error: float) -> Case:
     return replace(case, description=told, frames=[read(frame) for frame in case.frames])
 
 
-def noise_std(volts: SimulatedVolts, name: Channel, snr_db: float, snr_of: SnrOf) -> float:
-    """Standard deviation in volts of the noise on every voltage of a channel.
+def noise_stds(volts: SimulatedVolts, snr_db: float, snr_of: SnrOf) -> dict[Channel, float]:
+    """Standard deviation in volts of the noise on every voltage of each channel.
 
     It is the same on each, as a converter's is. A ratio of 20 dB is a tenth, in amplitude, of
 
@@ -255,10 +255,12 @@ def noise_std(volts: SimulatedVolts, name: Channel, snr_db: float, snr_of: SnrOf
       sheet has it. Changes are some 5 to 30 % of that in the structure channel and 0.2 to 4 % in
       the magnitude channel, so that the same number of decibels is far more noise.
     """
-    signal = volts.rest[name]
-    if snr_of == "change":
-        signal = volts.pressed[name] - signal
-    return float(np.sqrt(np.mean(signal**2)) * 10 ** (-snr_db / 20))
+    signals = {
+        name: volts.pressed[name] - rest if snr_of == "change" else rest
+        for name, rest in volts.rest.items()
+    }
+    share = 10 ** (-snr_db / 20)
+    return {name: float(np.sqrt(np.mean(s**2)) * share) for name, s in signals.items()}
 
 
 def measure(
@@ -276,9 +278,8 @@ def measure(
     """
     plan, volts, rng = simulated.plan, simulated.volts, np.random.default_rng(noise)
     count = len(plan.frames)
-    rest, scans = {}, {}
+    rest, scans, stds = {}, {}, noise_stds(volts, plan.snr_db, plan.snr_of)
     for name in simulated.told.channels:
-        std = noise_std(volts, name, plan.snr_db, plan.snr_of)
         clean, pressed = volts.rest[name], volts.pressed[name].copy()
         if plan.lead and name in plan.at_fault:
             floats_v = plan.lead.level * float(np.sqrt(np.mean(clean**2)))
@@ -286,7 +287,7 @@ def measure(
             pressed[-1] = with_lead(
                 simulated.told, pressed[-1], electrode, current, lambda *_, v=floats_v: v
             )
-        draws = std * rng.standard_normal((REFERENCE_SCANS + count, len(clean)))
+        draws = stds[name] * rng.standard_normal((REFERENCE_SCANS + count, len(clean)))
         parts = np.split(draws, [REFERENCE_SCANS if is_tare_drawn_first else count])
         of_tare, of_scans = parts if is_tare_drawn_first else parts[::-1]
         rest[name], scans[name] = clean + of_tare, pressed + of_scans

@@ -6,7 +6,7 @@ electrodes may be uneven: data must never come from the model that inverts them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from tactomo_protocol import Channel
@@ -160,6 +160,19 @@ def blended(full: FloatArray, coverage: FloatArray) -> FloatArray:
     power = np.where(even, 1.0, k)
     mixed = np.log1p(coverage * np.expm1(power * np.log(full))) / power
     return np.asarray(np.exp(np.where(even, coverage * np.log(full), mixed)))
+
+
+def noisy(
+    volts: Mapping[Channel, FloatArray],  # (..., M) of each channel
+    noise_v: Mapping[Channel, FloatArray | float],  # standard deviation of each channel's noise
+    rng: np.random.Generator,
+    *scans: int,  # shape of what is drawn, but for the voltages
+) -> dict[Channel, FloatArray]:
+    """Volts (*scans, M) of each channel, with a noise of one size on every voltage of a scan."""
+    return {
+        name: v + noise_v[name] * rng.standard_normal((*scans, v.shape[-1]))
+        for name, v in volts.items()
+    }
 
 
 def smooth_noise(

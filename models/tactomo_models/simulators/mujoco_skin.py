@@ -31,7 +31,7 @@ from tactomo_models.scene.press import Press
 from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.description_file import load_description
-from tactomo_models.simulation.simulator import SkinSimulator
+from tactomo_models.simulation.simulator import SkinSimulator, noisy
 
 MODULUS_PA: Final = 1e6
 """Effective modulus of the cover: soft rubber and foams have 0.3 to 3 MPa. Twice as stiff, contacts
@@ -176,9 +176,7 @@ class MujocoSkin:
 
     def _noisy(self, volts: dict[Channel, FloatArray]) -> dict[Channel, FloatArray]:
         noise_v = {name: self._noise * np.sqrt(np.mean(v**2)) for name, v in self._bare.items()}
-        return {
-            name: v + noise_v[name] * self._rng.standard_normal(len(v)) for name, v in volts.items()
-        }
+        return noisy(volts, noise_v, self._rng)
 
     def _readings(self, forces_n: dict[str, float]) -> list[tuple[str, float]]:
         """What companions read, each in its own unit."""
