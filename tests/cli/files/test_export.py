@@ -166,8 +166,7 @@ def test_what_goes_wrong_is_told(
     tactomo: Run, tmp_path: Path, arguments: list[str], status: int, says: str
 ) -> None:
     recording = (tmp_path / "grasp.mcap").read_bytes()
-    result = tactomo("export", *arguments)
-    assert result.returncode == status
+    result = tactomo("export", *arguments, status=status)
     assert says in result.stderr.replace("\n", " ")
     assert (tmp_path / "grasp.mcap").read_bytes() == recording
     assert sorted(path.name for path in tmp_path.iterdir()) == ["grasp.mcap"]

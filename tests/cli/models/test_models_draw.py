@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from fixture_types import Run
 from matplotlib.image import imread
 from small_sensor import SMALL
 
-Run = Callable[..., Any]
 DOTS_PER_MM = 150 / 25.4
 
 
@@ -24,8 +22,7 @@ def rims_apart(picture: Path, width_mm: float) -> int:
 
 def test_a_sheet_is_drawn_true_to_scale(tactomo: Run, tmp_path: Path) -> None:
     (tmp_path / "my_sheet.toml").write_text(SMALL)
-    result = tactomo("models", "draw", "my_sheet.toml", "-o", "my_sheet.png")
-    assert result.returncode == 0, result.stderr
+    result = tactomo("models", "draw", "my_sheet.toml", "-o", "my_sheet.png", status=0)
     assert result.stdout == "wrote my_sheet.png: small, scale 1 : 1\n"
     assert rims_apart(tmp_path / "my_sheet.png", 60) > 20
     assert rims_apart(tmp_path / "my_sheet.png", 50) == 0
@@ -37,8 +34,7 @@ def test_a_disc_is_drawn_and_larger_ones_on_a_smaller_scale(tactomo: Run, tmp_pa
     )
     large = large.replace('"rectangle"', '"disc"').replace("pitch_m = 0.02\n", "")
     (tmp_path / "large.toml").write_text(large)
-    result = tactomo("models", "draw", "large.toml")
-    assert result.returncode == 0, result.stderr
+    result = tactomo("models", "draw", "large.toml", status=0)
     assert result.stdout == "wrote small.png: small, scale 1 : 5\n"
 
 
@@ -49,6 +45,5 @@ def test_what_cannot_be_drawn_is_told(tactomo: Run, tmp_path: Path) -> None:
         (("no_such.toml",), "cannot read the sensor description no_such.toml"),
         (("paper_square", "-o", "picture.txt"), "not a kind of picture"),
     ):
-        result = tactomo("models", "draw", *arguments)
-        assert result.returncode == 1
+        result = tactomo("models", "draw", *arguments, status=1)
         assert said in result.stderr

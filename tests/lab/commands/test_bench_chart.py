@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from importlib import resources
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import pytest
+from fixture_types import Run
 from matplotlib.text import Text
 from tactomo_lab.commands import chart as bench_chart
 from tactomo_lab.commands.chart_picture import draw_chart
@@ -18,8 +17,6 @@ from tactomo_lab.evaluation.play import Variant
 from tactomo_lab.evaluation.trade_off import Point
 from tactomo_lab.scenes.measures import summarise
 from tactomo_models import available_methods
-
-Run = Callable[..., Any]
 
 
 def point(method: str, p50_s: float, icc: float, budget_s: float | None = None) -> Point:
@@ -107,8 +104,7 @@ def test_what_cannot_be_written_is_refused_before_the_work(
         ("nowhere/chart.png", "there is no folder nowhere"),
         ("chart.txt", "not a kind of picture"),
     ):
-        result = tactomo("bench", "--chart", picture)
-        assert result.returncode == 1
+        result = tactomo("bench", "--chart", picture, status=1)
         assert why in result.stderr
     assert not list(tmp_path.iterdir())
 
@@ -120,8 +116,9 @@ def test_the_whole_chart(tactomo: Run, tmp_path: Path) -> None:
     shipped = resources.files("tactomo_models.sensor.shipped").joinpath("paper_square.toml")
     sensor = tmp_path / "coarse.toml"
     sensor.write_text(shipped.read_text("utf-8") + "[map]\nnodes_x = 21\nnodes_y = 21\n")
-    result = tactomo("bench", "--chart", "chart.png", "--count", 1, "--json", "-d", sensor)
-    assert result.returncode == 0, result.stderr
+    result = tactomo(
+        "bench", "--chart", "chart.png", "--count", 1, "--json", "-d", sensor, status=0
+    )
     told = json.loads(result.stdout)
     assert told["live"] == []
     places = {(row["scene"], row["snr_db"]) for row in told["chart"]}

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
+from fixture_types import Run
 from small_sensor import SMALL
-
-Run = Callable[..., Any]
 
 
 @pytest.fixture
@@ -23,8 +20,7 @@ def few(tmp_path: Path) -> tuple[object, ...]:
 @pytest.mark.slow
 def test_in_numbers(tactomo: Run, few: tuple[object, ...]) -> None:
     ways = ("--method", "noser", "--method", "tikhonov", "--json")
-    result = tactomo(*few, "--figure", "5,9", *ways)
-    assert result.returncode == 0
+    result = tactomo(*few, "--figure", "5,9", *ways, status=0)
     told = json.loads(result.stdout)
     assert told["simulated"] is True
     assert set(told["figures"]) == {"5", "9"}
@@ -38,8 +34,7 @@ def test_in_numbers(tactomo: Run, few: tuple[object, ...]) -> None:
 
 @pytest.mark.slow
 def test_in_words(tactomo: Run, few: tuple[object, ...]) -> None:
-    result = tactomo(*few, "--figure", "10", "--method", "tikhonov")
-    assert result.returncode == 0
+    result = tactomo(*few, "--figure", "10", "--method", "tikhonov", status=0)
     assert "Ours are simulated, not measured: small, tuning seeds" in result.stdout
     for words in ("7.7 ± 6.6", "paper, hardware", "ours, simulated"):
         assert words in result.stdout
@@ -51,12 +46,10 @@ def test_a_method_that_cannot_be_had_is_said_and_left_out(
     tactomo: Run, few: tuple[object, ...]
 ) -> None:
     asked = (*few, "--figure", "9", "--method")
-    result = tactomo(*asked, "network", "--method", "tikhonov")
-    assert result.returncode == 0
+    result = tactomo(*asked, "network", "--method", "tikhonov", status=0)
     assert "left out: network" in result.stderr
     assert "Figs. 8 and 9" in result.stdout
-    result = tactomo(*asked, "network")
-    assert result.returncode == 1
+    result = tactomo(*asked, "network", status=1)
     assert "choose others with --method" in result.stderr
 
 
@@ -64,6 +57,5 @@ def test_a_method_that_cannot_be_had_is_said_and_left_out(
     ("option", "value"), [("--figure", "6"), ("--figure", "all"), ("--method", "magic")]
 )
 def test_what_it_does_not_know_is_a_usage_error(tactomo: Run, option: str, value: str) -> None:
-    result = tactomo("evaluate", "paper", option, value)
-    assert result.returncode == 2
+    result = tactomo("evaluate", "paper", option, value, status=2)
     assert repr(value) in result.stderr

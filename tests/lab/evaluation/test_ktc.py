@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from challenge_tanks import FINE_RINGS, challenge_pattern, simulated_tank
+from fixture_types import Run
 from shared_data import measured
 from tactomo_lab.evaluation.ktc import (
     evaluate_challenge,
@@ -21,7 +22,6 @@ from tactomo_lab.tanks.model import TankModel
 from tactomo_models import DataError, load_description
 from tactomo_models.arrays import FloatArray
 
-Run = Callable[..., Any]
 Arrays = dict[str, Any]
 
 SEED = 0
@@ -66,8 +66,7 @@ def simulated(tank_model: TankModel) -> Arrays:
 def test_simulated_tanks_are_scored(tactomo: Run, simulated: Arrays, tmp_path: Path) -> None:
     np.savez(tmp_path / "six.npz", **simulated)
     asked = ("evaluate", "ktc", tmp_path / "six.npz")
-    result = tactomo(*asked, "--json")
-    assert result.returncode == 0, result.stderr
+    result = tactomo(*asked, "--json", status=0)
     told = json.loads(result.stdout)
     scores = [tank["score"] for tank in told["tanks"]]
     assert told["score"] == pytest.approx(sum(scores))
@@ -114,11 +113,11 @@ def test_what_is_no_challenge(
 
 def test_what_the_command_refuses(tactomo: Run, simulated: Arrays, tmp_path: Path) -> None:
     np.savez(tmp_path / "turned.npz", **{**simulated, "reference": -simulated["reference"]})
-    result = tactomo("evaluate", "ktc", tmp_path / "turned.npz")
-    assert result.returncode == 1
+    result = tactomo("evaluate", "ktc", tmp_path / "turned.npz", status=1)
     assert "the reference is no scan of this tank" in result.stderr
-    result = tactomo("evaluate", "ktc", tmp_path / "turned.npz", "--description", "paper_square")
-    assert result.returncode == 1
+    result = tactomo(
+        "evaluate", "ktc", tmp_path / "turned.npz", "--description", "paper_square", status=1
+    )
     assert "no round tank" in result.stderr
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -12,6 +11,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 import torch
+from fixture_types import Run
 from small_sensor import SMALL
 from tactomo_lab.commands.training import ConfigurationName
 from tactomo_lab.training.batches import Batch, SceneBatches
@@ -40,8 +40,6 @@ from tactomo_models.sensor.symmetry import symmetries
 from variants import variant
 
 pytestmark = pytest.mark.train
-Run = Callable[..., Any]
-
 SCENES = 50
 TINY = Settings(epochs=2, batch=16, seed=3)
 
@@ -219,16 +217,14 @@ class TestCommand:
     ) -> None:
         command = ("models", "train", robust, "--configuration", "ours-small", "-d", square_file)
         files = ("--output", "ours.onnx", "--checkpoint", "ours.pt")
-        result = tactomo(*command, *files, "--epochs", 1, "--jobs", 1, "--json")
-        assert result.returncode == 0, result.stderr
+        result = tactomo(*command, *files, "--epochs", 1, "--jobs", 1, "--json", status=0)
         told = json.loads(result.stdout)
         assert (told["simulated"], told["configuration"], told["epochs"]) == (True, "ours-small", 1)
         (epoch,) = told["history"]
         assert epoch["loss"] > 0
         assert "epoch 1: loss" in result.stderr
         Network(tmp_path / "ours.onnx", load_description(square_file), "network")
-        again = tactomo(*command, *files, "--epochs", 1)
-        assert again.returncode == 0
+        again = tactomo(*command, *files, "--epochs", 1, status=0)
         assert "going on after epoch 1" in again.stderr
         other = tactomo(*command, *files, "--epochs", 2)
         assert "was begun with epochs 1, not 2" in other.stderr
@@ -243,8 +239,7 @@ class TestCommand:
     ) -> None:
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
         command = ("models", "train", robust, "--configuration", "ours-small", "--epochs", 1)
-        result = tactomo(*command, "--checkpoint", "ours.pt", "--description", square_file)
-        assert result.returncode == 0, result.stderr
+        tactomo(*command, "--checkpoint", "ours.pt", "--description", square_file, status=0)
         description = load_description(square_file)
         assert load_network(description, "network").path.is_relative_to(tmp_path)
         assert not SensorNetworks(description).missing
@@ -252,8 +247,7 @@ class TestCommand:
     def test_wrong_scenes_are_told(
         self, tactomo: Run, robust: Path, square_file: Path, tmp_path: Path
     ) -> None:
-        result = tactomo("models", "train", tmp_path, "--description", square_file)
-        assert result.returncode == 1
+        result = tactomo("models", "train", tmp_path, "--description", square_file, status=1)
         assert "holds no simulated scenes; make some: tactomo models simulate" in result.stderr
         result = tactomo("models", "train", robust)
         assert "holds scenes of format 3, sensor" in result.stderr
@@ -261,8 +255,7 @@ class TestCommand:
     def test_a_gpu_that_is_not_there_is_told(self, tactomo: Run, robust: Path) -> None:
         if torch.cuda.is_available():
             pytest.skip("there is one")
-        result = tactomo("models", "train", robust, "--device", "cuda")
-        assert result.returncode == 1
+        result = tactomo("models", "train", robust, "--device", "cuda", status=1)
         assert "PyTorch finds no GPU here; leave out --device, or use cpu" in result.stderr
 
 
