@@ -27,9 +27,9 @@ from tactomo.protocols.sciospec import Sciospec
 from tactomo.recordings.imported_scans import read_scans
 from tactomo.recordings.recording import Origin, open_recording
 from tactomo.recordings.recording_writer import (
+    Entry,
     RecordingWriter,
     mark_entry,
-    message_entry,
     port_entry,
     preamble_entry,
     reference_entry,
@@ -244,8 +244,8 @@ def _recording_examples() -> list[bytes]:
     writer.add(port_entry(0, encode(SCAN), 3, 3))
     writer.add(port_entry(1, b"\0\1\2", 4, 4))
     contacts = encode_message("left", CONTACTS, {**HEADER, "contacts": [CONTACT]})
-    writer.add(message_entry(MAP, encode_message("left", MAP, {**HEADER, "contacts": []}), 4, 4))
-    writer.add(message_entry(CONTACTS, contacts, 4, 4))
+    writer.add(Entry(MAP, encode_message("left", MAP, {**HEADER, "contacts": []}), 4, 4))
+    writer.add(Entry(CONTACTS, contacts, 4, 4))
     key = ScanKey(Channel.STRUCTURE, 7, 350_000)
     writer.add(mark_entry(Mark((key,), "fit", 4.0, reference_number=1), 5, 5))
     writer.flush()

@@ -95,11 +95,6 @@ def pack_mark(mark: Mark) -> bytes:
     return packed
 
 
-def message_entry(kind: str, data: bytes, monotonic_ns: int, realtime_ns: int) -> Entry:
-    """A stream message exactly as published."""
-    return Entry(kind, data, monotonic_ns, realtime_ns)
-
-
 class _File:
     """A file as the MCAP writer sees it: `write` collects, `hand_over` writes, wholly or not.
 

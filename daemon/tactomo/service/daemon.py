@@ -74,7 +74,7 @@ from tactomo.imaging.pipeline import Pipeline
 from tactomo.protocols import find_protocol, protocol_named
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import REPLAY_SCHEME, Origin, calibration_text
-from tactomo.recordings.recording_writer import message_entry
+from tactomo.recordings.recording_writer import Entry
 from tactomo.recordings.replay import Replay, parse_replay_url, read_replay, without_calibrations
 from tactomo.running import Running, announced
 from tactomo.service.status import Status
@@ -476,7 +476,7 @@ class Daemon:
     def _record_message(self, kind: str, data: bytes) -> None:
         active = self._recorder.active
         if active is not None and active.with_maps:
-            active.add(message_entry(kind, data, time.monotonic_ns(), wall_clock_ns()))
+            active.add(Entry(kind, data, time.monotonic_ns(), wall_clock_ns()))
 
     def _on_event(
         self, name: str, detail: str, next_step: str = "", about: str = "", reason: str = ""

@@ -112,7 +112,7 @@ def allow(
             "travelled",
         )
     key = read_public(public).decode("ascii")
-    client = Client(_checked(public.stem), key, may_command)
+    client = Client(check_sensor_name(public.stem, "key"), key, may_command)
     _check_server(folder, server)
     known = {other.name: other for other in list_clients(folder, server)}.get(client.name)
     if known is not None and known.public != key and not force:
@@ -188,15 +188,8 @@ def _clients(folder: Path, may_command: bool) -> list[Client]:
 
 
 def _places(folder: Path, server: str, name: str) -> tuple[Path, Path]:
-    listed, file = (
-        clients_folder(folder, server),
-        f"{check_sensor_name(name, 'key')}{PUBLIC_SUFFIX}",
-    )
-    return listed / file, listed / MAY_COMMAND / file
-
-
-def _checked(name: str) -> str:
-    return check_sensor_name(name, "key")
+    listed = clients_folder(folder, server)
+    return public_path(listed, name), public_path(listed / MAY_COMMAND, name)
 
 
 def _text(public: str, secret: str | None = None) -> str:

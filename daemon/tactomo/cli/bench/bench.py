@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from tactomo_client import Frame, Subscription
     from tactomo_models import SensorDescription
 
-    from tactomo.cli.console import Console
-
 SENSOR = "bench"
 SETTLE_S = 1.5
 STATUS_S = 13.0  # at 20 dual scans a second: as far back as the stage times in a status go
@@ -123,24 +121,17 @@ def bench(
         raise typer.BadParameter("--method goes with --chart")
     results = Results(machine(), description)
     if chart is not None:
-        _chart(results, chart, count, method or [], as_json)
-        return
-    from tactomo.cli.console import Console
-
-    with Console(stderr=True).status("starting") as line:
-        _measure_twin(results, ports, rate, seconds, line.update)
-    if as_json:
-        print_json(asdict(results))
+        measure = measurement("chart")
+        results.chart = measure(description, chart, count, results.machine, method or [])
     else:
-        _print(results)
+        from tactomo.cli.console import Console
 
-
-def _chart(results: Results, picture: Path, count: int, methods: list[str], as_json: bool) -> None:
-    results.chart = measurement("chart")(
-        results.description, picture, count, results.machine, methods
-    )
+        with Console(stderr=True).status("starting") as line:
+            _measure_twin(results, ports, rate, seconds, line.update)
     if as_json:
         print_json(asdict(results))
+    elif chart is None:
+        _print(results)
 
 
 def _measure_twin(
@@ -244,22 +235,17 @@ def _spot(description: SensorDescription, place: tuple[float, float]) -> tuple[f
 
 
 def _print(results: Results) -> None:
-    console = _console(results)
+    """Print on what everything was measured, and what came out."""
+    from tactomo.cli.console import page
+
+    console = page()
+    console.print(f"{results.machine}, sensor {results.description}")
     console.print(_live_table(results))
     console.print(_stage_table(results.live))
     console.print(
         f"late scans of the twin: {results.late_scans}; "
         f"dual scans dropped by the daemon: {results.dropped_scans}"
     )
-
-
-def _console(results: Results) -> Console:
-    """Return where to print, and say there on what everything was measured."""
-    from tactomo.cli.console import page
-
-    console = page()
-    console.print(f"{results.machine}, sensor {results.description}")
-    return console
 
 
 def _live_table(results: Results) -> Table:

@@ -208,21 +208,16 @@ def _values(
     values = {f"observation.tactile.{sensor}.{name}": array for name, array in arrays.items()}
     values["observation.time_s"] = np.zeros(1)
     if log is not None:
-        for name, is_of_it in (("action", True), ("observation.state", False)):
-            chosen = np.array(log.is_action, bool) == is_of_it
-            if chosen.any():
-                values[name] = log.numbers[row, chosen].astype(np.float32)
+        for name, columns in log.parts.items():
+            values[name] = log.numbers[row, columns].astype(np.float32)
     return values
 
 
 def _features(values: Mapping[str, Any], log: RobotLog | None) -> dict[str, Any]:
     from tactomo_client.touch import CONTACT_COLUMNS
 
-    names: dict[str, Any] = {}
-    for name, is_of_it in (("action", True), ("observation.state", False)):
-        if log is not None:
-            flags = zip(log.columns, log.is_action, strict=True)
-            names[name] = [column for column, is_action in flags if is_action == is_of_it]
+    parts = {} if log is None else log.parts
+    names = {part: [log.columns[n] for n in numbers] for part, numbers in parts.items() if log}
     columns = {"fields": list(CONTACT_COLUMNS)}
     return {
         name: {

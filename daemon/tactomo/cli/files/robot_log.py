@@ -38,9 +38,12 @@ class RobotLog:
     numbers: FloatArray  # (R, len(columns))
 
     @property
-    def is_action(self) -> list[bool]:
-        """Whether each column is of what the robot did; otherwise of what it measured."""
-        return [name.startswith(ACTION) for name in self.columns]
+    def parts(self) -> dict[str, list[int]]:
+        """Which columns are of what the robot did, and which of what it measured; none is empty."""
+        is_action = [name.startswith(ACTION) for name in self.columns]
+        parts = {"action": True, "observation.state": False}
+        of = {part: np.flatnonzero(np.equal(is_action, kind)) for part, kind in parts.items()}
+        return {part: numbers.tolist() for part, numbers in of.items() if len(numbers)}
 
     @property
     def first_of_episode(self) -> list[bool]:
