@@ -9,19 +9,15 @@ from __future__ import annotations
 
 import math
 import re
-import signal
 from collections.abc import Iterator
-from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import pytest
-from daemon_process import DaemonProcess
-from tactomo_client import Contact, request, subscribe
+from tactomo_client import Contact
 from tactomo_client.recording import open_recording
+from tactomo_models.sensor.description_file import shipped_text
 from terminal import Terminal
-from waiting import PATIENCE_S, wait_until
-from whole_system import ANYWHERE, tactomo, twin_of
+from whole_system import ANYWHERE, WatchedTwin, paper_twin, tactomo
 
 NAME = "palm"
 STIFFER = 1.2
@@ -31,38 +27,13 @@ LEVELS_KPA = (110, 165, 190, 220, 250, 235, 205, 175)
 HELD_OUT_KPA = (180, 200, 230)
 
 
-@pytest.fixture
-def twin(tmp_path: Path) -> Iterator[dict[str, list[str]]]:
-    """A twin whose response table lies at higher pressures than the description's."""
-    text = (
-        resources.files("tactomo_models.sensor.shipped").joinpath("paper_square.toml").read_text()
-    )
-    table = re.search(r"\[magnitude.response\]\npressure_kpa *= \[(.*?)\]", text)
-    assert table
-    higher = ", ".join(str(STIFFER * float(kpa)) for kpa in table[1].split(","))
-    sensor = tmp_path / "stiffer.toml"
-    sensor.write_text(text.replace(table[1], higher, 1))
-    with twin_of(sensor, tmp_path / "ports") as said:
-        yield said
-
-
-class Bench:
+class Bench(WatchedTwin):
     """The skin under a press of known force, and a daemon that looks at it."""
-
-    def __init__(self, twin: dict[str, list[str]], folder: Path) -> None:
-        self._control = str(twin["control"])
-        self.daemon = DaemonProcess(folder, twin["ports"], name=NAME)
-        wait_until(lambda: self.daemon.status()["state"] == "running", "a reference")
-
-    def clear(self) -> None:
-        request("clear", self._control, PATIENCE_S)
 
     def contact(self, kpa: float) -> Contact:
         """What the daemon says of a press that it has had time to look at."""
-        place: dict[str, Any] = {"x_mm": 5.0, "y_mm": -8.0, "radius_mm": 15}
-        request("press", self._control, PATIENCE_S, **place, pressure_kpa=kpa)
-        before = request("status", self._control, PATIENCE_S)["counter"]
-        with subscribe(NAME, address=self.daemon.stream, timeout_s=PATIENCE_S) as frames:
+        before = self.press(x_mm=5.0, y_mm=-8.0, radius_mm=15, pressure_kpa=kpa)
+        with self.frames() as frames:
             seen = 0
             for frame in frames:
                 # By the network alone where others take the processor for a while.
@@ -72,17 +43,18 @@ class Bench:
                     return frame.contacts[0]
         raise AssertionError
 
-    def close(self) -> None:
-        self.clear()
-        self.daemon.popen.send_signal(signal.SIGINT)
-        self.daemon.popen.wait(PATIENCE_S)
-
 
 @pytest.fixture
-def bench(twin: dict[str, list[str]], tmp_path: Path) -> Iterator[Bench]:
-    bench = Bench(twin, tmp_path)
-    yield bench
-    bench.close()
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    """Of a twin whose response table lies at higher pressures than the description's."""
+    table = re.search(r"\npressure_kpa *= \[(.*?)\]", shipped_text("paper_square"))
+    assert table
+    higher = ", ".join(str(STIFFER * float(kpa)) for kpa in table[1].split(","))
+    with paper_twin(tmp_path, (table[1], higher)) as twin:
+        bench = Bench(twin, tmp_path, NAME)
+        yield bench
+        bench.clear()
+        bench.close()
 
 
 @pytest.mark.slow

@@ -16,7 +16,6 @@ from page import first_line_of_the_readme
 from processes import children_of, is_running
 from selenium.webdriver import ActionChains, Chrome
 from selenium.webdriver.common.by import By
-from small_sensor import SMALL
 from tactomo_client import Frame, request, subscribe
 from waiting import PATIENCE_S, wait_until
 from whole_system import SENSOR, Demo, running_demo
@@ -120,10 +119,10 @@ def test_doctor_finds_a_healthy_skin_and_noise(tactomo: Run, demo: Demo) -> None
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
-def test_a_demo_that_ends_leaves_no_process_behind(number: signal.Signals, tmp_path: Path) -> None:
-    sensor = tmp_path / "small.toml"
-    sensor.write_text(SMALL)
-    with running_demo("--description", str(sensor)) as demo:
+def test_a_demo_that_ends_leaves_no_process_behind(
+    number: signal.Signals, small_file: Path
+) -> None:
+    with running_demo("--description", str(small_file)) as demo:
         children = children_of(demo.process.pid)
         assert len(children) == 3
         os.kill(demo.process.pid, number)

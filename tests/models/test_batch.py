@@ -44,13 +44,6 @@ def arrays(skin: Skin) -> Arrays:
     }
 
 
-@pytest.fixture(autouse=True)
-def _artifact_at_hand(
-    paper: SensorDescription, artifact: object, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("tactomo_models.methods.method.load_or_build_artifact", lambda _: artifact)
-
-
 @pytest.fixture
 def run(tmp_path: Path, paper: SensorDescription) -> Run:
     """Reconstruct arrays by a method, of the paper's sensor or another: the arrays of the file."""

@@ -7,16 +7,18 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
+from daemon_process import DaemonProcess
 from tactomo.cli.children import Family
-from tactomo_client import request
-from waiting import PATIENCE_S
+from tactomo_client import Frame, request, subscribe
+from tactomo_models.sensor.description_file import shipped_text
+from waiting import PATIENCE_S, wait_until
 
 SENSOR = "left_forearm"
 ANYWHERE = "tcp://127.0.0.1:0"
@@ -83,6 +85,47 @@ def tactomo(*arguments: object) -> str:
 def repository() -> Path:
     """Root of this checkout."""
     return Path(__file__).parents[2]
+
+
+class WatchedTwin:
+    """A twin that is otherwise than the description says, and a daemon that looks at it."""
+
+    def __init__(self, twin: Mapping[str, Any], folder: Path, name: str) -> None:
+        self.name = name
+        self._control = str(twin["control"])
+        self.daemon = DaemonProcess(folder, twin["ports"], name=name)
+        wait_until(lambda: self.daemon.status()["state"] == "running", "a reference")
+
+    def press(self, **where: Any) -> int:
+        """Press one place; returns the number of the scan that the twin is at."""
+        request("press", self._control, PATIENCE_S, **where)
+        return int(request("status", self._control, PATIENCE_S)["counter"])
+
+    def clear(self) -> None:
+        """Lift everything off."""
+        request("clear", self._control, PATIENCE_S)
+
+    def frames(self) -> AbstractContextManager[Iterator[Frame]]:
+        """What the daemon publishes."""
+        return subscribe(self.name, address=self.daemon.stream, timeout_s=PATIENCE_S)
+
+    def close(self) -> None:
+        """Stop the daemon as Ctrl-C would."""
+        self.daemon.signal(signal.SIGINT)
+        self.daemon.popen.wait(PATIENCE_S)
+
+
+@contextmanager
+def paper_twin(folder: Path, *changes: tuple[str, str]) -> Iterator[dict[str, list[str]]]:
+    """Run `tactomo twin` of the paper's sensor with parts of its description in other words."""
+    text = shipped_text("paper_square")
+    for old, new in changes:
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    description = folder / "otherwise.toml"
+    description.write_text(text)
+    with twin_of(description, folder / "ports") as said:
+        yield said
 
 
 @contextmanager

@@ -14,7 +14,6 @@ import pytest
 import serial
 from fixture_types import Start
 from hostile_page import post
-from small_sensor import SMALL
 from tactomo.errors import AddressError, ConfigError, TactomoError
 from tactomo.protocols.native import NativeProtocol
 from tactomo.twin import Scene, TwinConfig
@@ -288,11 +287,10 @@ def test_equal_seeds_give_equal_scans(bench: Start) -> None:
     assert first_scans(1) == first_scans(1) != first_scans(2)
 
 
-def test_the_skin_drifts_as_it_is_told_live_and_by_a_scene(bench: Start, tmp_path: Path) -> None:
-    file = tmp_path / "small.toml"
-    file.write_text(SMALL)
-    sensor = load_description(file)
-    started = bench(skin=SkinSimulator(sensor), sensor=str(file))
+def test_the_skin_drifts_as_it_is_told_live_and_by_a_scene(
+    bench: Start, small: SensorDescription, small_file: Path
+) -> None:
+    started = bench(skin=SkinSimulator(small), sensor=str(small_file))
     host = started.host().start()
     host.wait_for(lambda: host.scans())
     rest = host.scans()[0].samples

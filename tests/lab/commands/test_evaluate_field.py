@@ -7,15 +7,12 @@ from pathlib import Path
 
 import pytest
 from fixture_types import Run
-from small_sensor import SMALL
 
 
 @pytest.fixture
-def field(tactomo: Run, tmp_path: Path) -> Run:
-    sensor = tmp_path / "small.toml"
-    sensor.write_text(SMALL)
+def field(tactomo: Run, small_file: Path) -> Run:
     return lambda *more, **ending: tactomo(
-        "evaluate", "field", "--description", sensor, *more, **ending
+        "evaluate", "field", "--description", small_file, *more, **ending
     )
 
 

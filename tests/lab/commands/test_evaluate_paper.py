@@ -7,14 +7,11 @@ from pathlib import Path
 
 import pytest
 from fixture_types import Run
-from small_sensor import SMALL
 
 
 @pytest.fixture
-def few(tmp_path: Path) -> tuple[object, ...]:
-    sensor = tmp_path / "small.toml"
-    sensor.write_text(SMALL)
-    return ("evaluate", "paper", "--description", sensor, "--count", 1, "--sheets", 1)
+def few(small_file: Path) -> tuple[object, ...]:
+    return ("evaluate", "paper", "--description", small_file, "--count", 1, "--sheets", 1)
 
 
 @pytest.mark.slow

@@ -9,13 +9,8 @@ from tactomo_lab.evaluation.field import cases_of_row
 from tactomo_lab.evaluation.play import play
 from tactomo_lab.scenes.case import Case
 from tactomo_lab.scenes.measures import Summary, summarise
-from tactomo_models import Artifact, SensorDescription
+from tactomo_models import SensorDescription
 from tactomo_protocol import Channel
-
-
-@pytest.fixture(autouse=True)
-def _built(artifact: Artifact, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tactomo_lab.evaluation.play.load_or_build_artifact", lambda _: artifact)
 
 
 def summary(case: Case) -> Summary:

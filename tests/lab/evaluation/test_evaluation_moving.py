@@ -18,7 +18,7 @@ from tactomo_lab.evaluation.play import play
 from tactomo_lab.scenes.case import Case, Simulated, SimulatedVolts, as_described
 from tactomo_lab.scenes.drawing import BOTH_CHANNELS, GAP_M, gap_m, outline_of
 from tactomo_lab.scenes.measures import Score
-from tactomo_models import Artifact, Press, SensorDescription, SkinSimulator
+from tactomo_models import Press, SensorDescription, SkinSimulator
 from tactomo_models.scene.tracking import MAX_MISSED
 from tactomo_protocol import Channel
 
@@ -81,11 +81,6 @@ def sequence(
 
 def played(case: Case, method: str = "auto") -> list[Score]:
     return [outcome.score for outcome in play([case], method)]
-
-
-@pytest.fixture(autouse=True)
-def _built(artifact: Artifact, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tactomo_lab.evaluation.play.load_or_build_artifact", lambda _: artifact)
 
 
 @pytest.mark.slow

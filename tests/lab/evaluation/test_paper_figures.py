@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -24,17 +23,8 @@ from tactomo_lab.evaluation.paper import (
 from tactomo_lab.evaluation.play import Outcome, play
 from tactomo_lab.scenes.case import Case
 from tactomo_lab.scenes.drawing import BOTH_CHANNELS, outline_of
-from tactomo_models import Artifact, SensorDescription, build_artifact
+from tactomo_models import SensorDescription
 from tactomo_models.scene.contacts import Contact
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _built(small: SensorDescription) -> Iterator[None]:
-    artifact: Artifact = build_artifact(small)
-    with pytest.MonkeyPatch.context() as patch:
-        name = "tactomo_lab.evaluation.play.load_or_build_artifact"
-        patch.setattr(name, lambda _: artifact)
-        yield
 
 
 @pytest.fixture(scope="module")

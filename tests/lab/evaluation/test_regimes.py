@@ -20,7 +20,7 @@ from tactomo_lab.scenes.simulation import (
     fine_mesh,
     with_opposite_magnitude,
 )
-from tactomo_models import Artifact, Reconstructor, SensorDescription, build_artifact
+from tactomo_models import Reconstructor, SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics import tikhonov as linear
 from tactomo_models.scene.press import Press, Profile, Shape
@@ -174,20 +174,6 @@ def test_a_skin_may_be_warped(small: SensorDescription) -> None:
     assert 0 < change(*changes) < 0.2
 
 
-@pytest.fixture(scope="module")
-def small_artifact(small: SensorDescription) -> Artifact:
-    return build_artifact(small)
-
-
-@pytest.fixture(autouse=True)
-def _built(
-    small: SensorDescription, small_artifact: Artifact, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        "tactomo_lab.evaluation.play.load_or_build_artifact", lambda _: small_artifact
-    )
-
-
 def last_of(case: Case) -> Outcome:
     *_, last = play([case], "tikhonov")
     return last
@@ -216,11 +202,11 @@ def test_regularisation_is_so_many_times_what_the_rule_chooses(
 
 
 def test_a_case_is_judged_by_its_last_frame(
-    small: SensorDescription, small_artifact: Artifact
+    small: SensorDescription,
 ) -> None:
     case = case_of(small, "jump")
     (outcome,) = frames_of_row(small, "jump", "tikhonov", "tuning", 1)["jump"]
-    alone = Reconstructor(case.description, small_artifact, method="tikhonov")
+    alone = Reconstructor(case.description, method="tikhonov")
     alone.set_reference(case.tare)
     scans = case.frames[-1].scans
     frame = alone.reconstruct(scans[Channel.MAGNITUDE], scans[Channel.STRUCTURE])

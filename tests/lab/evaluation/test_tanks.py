@@ -104,12 +104,8 @@ def test_a_file_of_scans_of_such_a_tank(
     tank_artifact: Artifact,
     drawn: Tanks,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """What a user has: volts with objects and without; contacts are of both kinds."""
-    monkeypatch.setattr(
-        "tactomo_models.methods.method.load_or_build_artifact", lambda _: tank_artifact
-    )
     empty = ForwardModel(tank, tank_artifact.bare).bare_voltages
     scan = empty + np.sign(empty) * drawn.changes[0]
     np.savez(

@@ -18,7 +18,7 @@ from tactomo_lab.evaluation.trade_off import (
 )
 from tactomo_lab.scenes.measures import summarise
 from tactomo_lab.scenes.still_scenes import draw_still, still_case
-from tactomo_models import Artifact, SensorDescription, available_methods
+from tactomo_models import SensorDescription, available_methods
 from tactomo_models.methods.registry import BUDGETED
 
 
@@ -63,9 +63,8 @@ def test_every_method_has_a_point_and_auto_and_fit_one_for_every_budget() -> Non
 
 @pytest.mark.slow
 def test_still_scenes_are_measured_under_each_budget(
-    paper: SensorDescription, artifact: Artifact, monkeypatch: pytest.MonkeyPatch
+    paper: SensorDescription,
 ) -> None:
-    monkeypatch.setattr("tactomo_lab.evaluation.play.load_or_build_artifact", lambda _: artifact)
     drawn = [still_case(paper, draw_still(paper, "tuning", 3, 0), "tuning", 0, 20.0)]
     asked = [Variant("tikhonov"), Variant("fit", 0.001), Variant("fit", 0.2)]
     linear, hasty, patient = points_of(play(drawn, *asked))

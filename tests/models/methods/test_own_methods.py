@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_sensor import SMALL
 from tactomo_models import (
     Estimate,
     Flag,
@@ -24,7 +23,6 @@ from tactomo_models import (
     Skin,
     SkinSimulator,
     UnsolvableError,
-    load_description,
 )
 from tactomo_models.arrays import FloatArray
 
@@ -49,33 +47,26 @@ class Own:
 
 
 @pytest.fixture(scope="module")
-def sensor(tmp_path_factory: pytest.TempPathFactory) -> SensorDescription:
-    path = tmp_path_factory.mktemp("sensor") / "small.toml"
-    path.write_text(SMALL)
-    return load_description(path)
-
-
-@pytest.fixture(scope="module")
-def volts(sensor: SensorDescription) -> tuple[Any, Any]:
+def volts(small: SensorDescription) -> tuple[Any, Any]:
     """Voltages at rest and pressed."""
-    skin = SkinSimulator(sensor)
+    skin = SkinSimulator(small)
     return skin.voltages([]), skin.voltages([Press(0.005, 0.0, 150.0, 0.006)])
 
 
 def frames(
-    sensor: SensorDescription, volts: tuple[Any, Any], method: Own, count: int = 1
+    small: SensorDescription, volts: tuple[Any, Any], method: Own, count: int = 1
 ) -> list[Reconstruction]:
     rest, pressed = volts
-    reconstructor = Reconstructor(sensor, method=method)
+    reconstructor = Reconstructor(small, method=method)
     reconstructor.set_reference(Reference(rest["magnitude"], rest["structure"]))
     return [
         reconstructor.reconstruct(pressed["magnitude"], pressed["structure"]) for _ in range(count)
     ]
 
 
-def test_a_map_suffices(sensor: SensorDescription, volts: tuple[Any, Any]) -> None:
+def test_a_map_suffices(small: SensorDescription, volts: tuple[Any, Any]) -> None:
     own = Own(lambda image: Estimate(map=image))
-    first, second = frames(sensor, volts, own, 2)
+    first, second = frames(small, volts, own, 2)
     assert (first.tier, first.failure) == ("Own", "")
     assert [contact.magnitude for contact in first.contacts] == pytest.approx([0.2])
     assert first.contacts[0].id == second.contacts[0].id
@@ -88,9 +79,9 @@ def refuse(image: FloatArray) -> Estimate:
 
 
 def test_a_method_may_find_nothing_to_solve(
-    sensor: SensorDescription, volts: tuple[Any, Any]
+    small: SensorDescription, volts: tuple[Any, Any]
 ) -> None:
-    (frame,) = frames(sensor, volts, Own(refuse))
+    (frame,) = frames(small, volts, Own(refuse))
     assert (frame.tier, frame.failure) == ("tikhonov", "")
     assert frame.reason == "no voltage is large enough"
 
@@ -111,10 +102,10 @@ def test_a_method_may_find_nothing_to_solve(
 )
 @pytest.mark.filterwarnings("ignore:.*encountered in divide")
 def test_what_fails_is_named_and_the_frame_goes_on(
-    sensor: SensorDescription, volts: tuple[Any, Any], answer: Answer, cause: str
+    small: SensorDescription, volts: tuple[Any, Any], answer: Answer, cause: str
 ) -> None:
     own = Own(answer)
-    first, second = frames(sensor, volts, own, 2)
+    first, second = frames(small, volts, own, 2)
     for frame in (first, second):
         assert frame.tier == "tikhonov"
         assert frame.map is not None
@@ -148,20 +139,20 @@ def test_a_module_is_found_in_the_working_folder(tmp_path: Path) -> None:
 
 
 def test_a_class_that_needs_arguments_is_no_method(
-    sensor: SensorDescription, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small: SensorDescription, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "needy.py").write_text(MODULE)
     monkeypatch.syspath_prepend(tmp_path)
-    reconstructor = Reconstructor(sensor)
+    reconstructor = Reconstructor(small)
     with pytest.raises(MethodError, match=r"needy:Needy' cannot be made.*without arguments"):
         reconstructor.method = "needy:Needy"
 
 
-def test_the_mesh_has_the_jacobians_nodes_and_a_laplace_prior(sensor: SensorDescription) -> None:
-    skin = Skin.of(sensor)
+def test_the_mesh_has_the_jacobians_nodes_and_a_laplace_prior(small: SensorDescription) -> None:
+    skin = Skin.of(small)
     mesh = skin.mesh
     assert len(mesh.nodes_m) == len(mesh.areas_m2) == skin.artifact.jacobian.shape[1]
-    assert mesh.electrodes_m.shape == (sensor.electrode_count, 2)
+    assert mesh.electrodes_m.shape == (small.electrode_count, 2)
     one, two = (
         mesh.nodes_m[mesh.triangles[:, k]] - mesh.nodes_m[mesh.triangles[:, 0]] for k in (1, 2)
     )
