@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from frame_fields import frame_fields
 from tactomo.recordings.recording import Origin
 from tactomo.recordings.recording_writer import Entry, RecordingWriter, port_entry
 from tactomo_client import Contact, Frame, MessageError, RecordingError, subscribe
@@ -29,21 +30,9 @@ CONTACT = Contact(3, 10.0, -20.0, 700.0, 0.15, 0.01, 170.0)
 def entries(number: int, at_s: float) -> list[Entry]:
     """Return what a daemon writes for one dual scan: bytes, its map and its contacts."""
     at_ns = round(at_s * 1e9)
-    fields = {
-        "session": "a",
-        "sequence": number,
-        "scan_counter": number,
-        "acquired_realtime_ns": at_ns,
-        "acquired_monotonic_ns": at_ns,
-        "clock_id": clock_id(),  # this computer's, and yet the age does not go by its clock
-        "device_us": at_ns // 1000,
-        "age_ns": 7_000_000,
-        "tier": "fit",
-        "tier_reason": None,
-        "flags": [],
-        "misfit": 1.0,
-        "contacts": [dataclasses.asdict(dataclasses.replace(CONTACT, id=number))],
-    }
+    contact = dataclasses.replace(CONTACT, id=number)
+    # The clock is this computer's, and yet the age does not go by it.
+    fields = frame_fields(number, at_ns, [contact], clock_id=clock_id())
     images = {"map": RAMP * number, "pressure_kpa": None, "structure": RAMP}
     extent = {"x_mm": [-75.0, 75.0], "y_mm": [-75.0, 75.0]}
     as_map = encode_message("left", "map", fields | images | extent)

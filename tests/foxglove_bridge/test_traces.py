@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
 
+from frame_fields import frame_fields
 from mcap.reader import make_reader
 from tactomo_client import Contact, Frame
 from tactomo_client.messages import decode_message, encode_message, frame_from_message
@@ -17,13 +17,7 @@ PERIOD_NS = 50_000_000
 
 def frame(number: int, ids: Sequence[int], session: str = "a") -> Frame:
     contacts = [Contact(each, 1.0, 2.0, 700.0, 0.1, 0.01, 100.0 + each) for each in ids]
-    fields = {
-        **{"session": session, "sequence": number, "scan_counter": number},
-        **{"acquired_realtime_ns": PERIOD_NS * number, "acquired_monotonic_ns": PERIOD_NS * number},
-        **{"device_us": None, "age_ns": 0, "tier": "fit", "tier_reason": None},
-        **{"flags": [], "misfit": 1.0},
-        "contacts": [dataclasses.asdict(contact) for contact in contacts],
-    }
+    fields = frame_fields(number, PERIOD_NS * number, contacts, session=session)
     return frame_from_message(decode_message(encode_message("left", "contacts", fields)), None, 0.5)
 
 

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import sciospec_stream
+from frame_fields import frame_fields
 from pydantic import ValidationError
 from tactomo.config import load_config
 from tactomo.errors import ConfigError, RecordingError, TactomoError
@@ -98,19 +99,10 @@ PACKETS: tuple[Packet, ...] = (
     Acknowledge(1, CommandCode.START, AckStatus.OK),
     Command(CommandCode.SET_RATE, request=1, rate_hz=20.0),
 )
-ENVELOPE: dict[str, Any] = {
-    "session": "0123456789abcdef",
-    "sequence": 7,
-    "acquired_realtime_ns": 1_700_000_000_000_000_000,
-    "acquired_monotonic_ns": 123_456_789,
-    "device_us": 42,
-    "age_ns": 1_000_000,
-    "tier": "levelset",
-    "tier_reason": "two contacts",
-    "flags": ["misfit_high"],
-    "misfit": 1.25,
-}
-HEADER = {**ENVELOPE, "scan_counter": 3}
+HEADER = frame_fields(
+    7, 1_700_000_000_000_000_000, tier_reason="two contacts", flags=["misfit_high"]
+)
+ENVELOPE = {k: v for k, v in HEADER.items() if k not in ("scan_counter", "contacts")}
 PRESS = {"at_s": 0.0, "duration_s": 1.0, "x_mm": 1.0, "y_mm": 2.0}
 CONTACT = {"id": 1, "x_mm": 1.0, "y_mm": -2.0, "area_mm2": 700.0, "magnitude": None}
 
@@ -244,7 +236,7 @@ def _recording_examples() -> list[bytes]:
     writer.add(port_entry(0, encode(SCAN), 3, 3))
     writer.add(port_entry(1, b"\0\1\2", 4, 4))
     contacts = encode_message("left", CONTACTS, {**HEADER, "contacts": [CONTACT]})
-    writer.add(Entry(MAP, encode_message("left", MAP, {**HEADER, "contacts": []}), 4, 4))
+    writer.add(Entry(MAP, encode_message("left", MAP, HEADER), 4, 4))
     writer.add(Entry(CONTACTS, contacts, 4, 4))
     key = ScanKey(Channel.STRUCTURE, 7, 350_000)
     writer.add(mark_entry(Mark((key,), "fit", 4.0, reference_number=1), 5, 5))

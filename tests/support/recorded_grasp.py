@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from frame_fields import frame_fields
 from tactomo.recordings.recording import Origin
 from tactomo.recordings.recording_writer import RecordingWriter
 from tactomo_client import Contact
@@ -76,21 +76,16 @@ def messages_of(number: int, changes: Mapping[str, Any]) -> list[tuple[str, byte
     """Return what a daemon publishes for one dual scan, with some fields otherwise."""
     at_ns = START_NS + number * PERIOD_NS
     monotonic_ns = MONOTONIC_NS + number * PERIOD_NS
-    fields: dict[str, Any] = {
+    contacts = contacts_of(number)
+    own: dict[str, Any] = {
         "session": "run",
-        "sequence": number,
         "scan_counter": 1000 + number,
         "acquired_realtime_ns": at_ns,
-        "acquired_monotonic_ns": monotonic_ns,
-        "device_us": monotonic_ns // 1000,
-        "age_ns": 7_000_000,
-        "tier": "quiet" if not contacts_of(number) else "fit",
-        "tier_reason": None,
+        "tier": "quiet" if not contacts else "fit",
         "flags": ["misfit_high"] if number in (33, 34) else [],
         "misfit": 1.0 + 0.01 * (number % 7),
-        "contacts": [dataclasses.asdict(contact) for contact in contacts_of(number)],
-        **changes,
     }
+    fields = frame_fields(number, monotonic_ns, contacts) | own | dict(changes)
     images = {
         name: None if image is None else array_to_wire(image)
         for name, image in images_of(number).items()
