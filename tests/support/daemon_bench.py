@@ -17,12 +17,11 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-import zmq
+from ears import listening
 from mcap.reader import make_reader
 from tactomo.recordings.recording import open_recording
 from tactomo.service.daemon import Daemon
 from tactomo_client import Keys, request
-from tactomo_client.keys import secure
 from tactomo_client.messages import KINDS, Message, array_from_wire, decode_message, topic
 from tactomo_models import Contact, Flag, Reconstruction, Reference
 from tactomo_models.arrays import FloatArray, Image
@@ -182,13 +181,7 @@ class Listener:
         keys: Keys | None = None,
     ) -> None:
         self.messages: list[Message] = []
-        self.socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
-        self.socket.setsockopt(zmq.LINGER, 0)
-        self.socket.setsockopt(zmq.RCVHWM, 0)
-        for kind in kinds:
-            self.socket.setsockopt(zmq.SUBSCRIBE, topic(sensor, kind))
-        secure(self.socket, address, keys)
-        self.socket.connect(address)
+        self.socket = listening(address, *(topic(sensor, kind) for kind in kinds), keys=keys)
 
     def receive(self) -> None:
         while self.socket.poll(0):

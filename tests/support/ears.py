@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,8 +9,10 @@ from typing import Any
 
 import numpy as np
 import zmq
+from tactomo_client import Keys
+from tactomo_client.keys import secure
 from tactomo_client.messages import decode_message, topic
-from waiting import PATIENCE_S, wait_until
+from waiting import PATIENCE_S, InThread, wait_until
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,20 +39,25 @@ class Heard:
         return float(self.fields["age_ns"] * 1e-6)
 
 
-class Ears:
+def listening(address: str, *topics: bytes, keys: Keys | None = None) -> zmq.Socket[bytes]:
+    """Subscribe to topics; no message that comes is thrown away."""
+    socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
+    socket.setsockopt(zmq.LINGER, 0)
+    socket.setsockopt(zmq.RCVHWM, 0)
+    for each in topics:
+        socket.setsockopt(zmq.SUBSCRIBE, each)
+    secure(socket, address, keys)
+    socket.connect(address)
+    return socket
+
+
+class Ears(InThread):
     """Hears `kinds` of one sensor until closed; usable in a `with` block."""
 
     def __init__(self, address: str, sensor: str = "skin", kinds: tuple[str, ...] = ("contacts",)):
         self.heard: list[Heard] = []
-        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.RCVHWM, 0)
-        for kind in kinds:
-            self._socket.setsockopt(zmq.SUBSCRIBE, topic(sensor, kind))
-        self._socket.connect(address)
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="ears")
-        self._thread.start()
+        self._socket = listening(address, *(topic(sensor, kind) for kind in kinds))
+        super().__init__()
 
     def of(self, kind: str) -> list[Heard]:
         """Return what came of one kind so far."""
@@ -76,25 +82,14 @@ class Ears:
 
         return wait_until(found, what, patience_s, step_s=0.002)[0]
 
-    def close(self) -> None:
-        """Stop listening."""
-        self._closing.set()
-        self._thread.join()
-        self._socket.close()
-
-    def __enter__(self) -> Ears:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _run(self) -> None:
-        while not self._closing.is_set():
-            if self._socket.poll(50):
-                data = self._socket.recv()
-                arrived_ns = time.monotonic_ns()
-                message = decode_message(data)
-                self.heard.append(Heard(message.kind, arrived_ns, message.fields))
+        with self._socket as socket:
+            while not self._closing.is_set():
+                if socket.poll(50):
+                    data = socket.recv()
+                    arrived_ns = time.monotonic_ns()
+                    message = decode_message(data)
+                    self.heard.append(Heard(message.kind, arrived_ns, message.fields))
 
 
 def percentiles(values: list[float]) -> str:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Mapping
-from typing import Any, Self
+from typing import Any
 
 import zmq
 from tactomo_client.errors import ControlError
 from tactomo_client.fake import bind_when_free
 from tactomo_client.messages import decode_request, encode_error, encode_reply
+from waiting import InThread
 
 
-class FakeControl:
+class FakeControl(InThread):
     """A control socket at an ephemeral port that notes what it is asked, in a thread of its own.
 
     Args:
@@ -31,27 +31,14 @@ class FakeControl:
     ) -> None:
         self.answers = dict(answers or {})
         self.requests: list[tuple[str, dict[str, Any]]] = []
-        self._stop = threading.Event()
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REP)
         self._socket.setsockopt(zmq.LINGER, 1000)
         self.address = bind_when_free(self._socket, address)
-        self._thread = threading.Thread(target=self._run, name="fake control")
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop answering and give the port back."""
-        self._stop.set()
-        self._thread.join()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        super().__init__()
 
     def _run(self) -> None:
         with self._socket as socket:
-            while not self._stop.is_set():
+            while not self._closing.is_set():
                 if socket.poll(20):
                     socket.send(self._reply(socket.recv()))
 

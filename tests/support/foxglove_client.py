@@ -11,13 +11,13 @@ from typing import Any
 
 import aiohttp
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-from waiting import PATIENCE_S, wait_until
+from waiting import PATIENCE_S, InThread, wait_until
 
 PROTOCOL = "foxglove.sdk.v1"
 MESSAGE_DATA = 1
 
 
-class FoxgloveClient:
+class FoxgloveClient(InThread):
     """A client that subscribes to all topics, in a thread; `reads` False: connects and stops there.
 
     Attributes:
@@ -31,11 +31,9 @@ class FoxgloveClient:
         self.said: list[dict[str, Any]] = []
         self._messages: list[tuple[str, bytes]] = []
         self._url, self._reads = url, reads
-        self._stop = threading.Event()
         self._connected = threading.Event()
         self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
+        super().__init__()
         assert self._connected.wait(PATIENCE_S), "no connection"
         if self._error:
             raise self._error
@@ -77,16 +75,6 @@ class FoxgloveClient:
             return json.loads(data)
         return protobuf(channel["schemaName"], base64.b64decode(channel["schema"]), data)
 
-    def close(self) -> None:
-        self._stop.set()
-        self._thread.join()
-
-    def __enter__(self) -> FoxgloveClient:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _run(self) -> None:
         try:
             asyncio.run(self._look())
@@ -101,7 +89,7 @@ class FoxgloveClient:
             session.ws_connect(self._url, protocols=[PROTOCOL], max_msg_size=0) as socket,
         ):
             assert socket.protocol == PROTOCOL
-            while not self._stop.is_set():
+            while not self._closing.is_set():
                 if not self._reads and self._connected.is_set():
                     await asyncio.sleep(0.05)
                     continue

@@ -7,17 +7,17 @@ from __future__ import annotations
 
 import math
 import re
-import threading
 from collections.abc import Iterator
 from functools import cache
 from types import UnionType
 from typing import Any
 
 import msgpack  # type: ignore[import-untyped]
-import zmq
+from ears import listening
 from tables import table
 from tactomo_client.messages import EVENT, MAP, STATUS, decode_message, frame_from_message
 from tactomo_client.schema import Status
+from waiting import InThread
 
 PAGE = "clients/STREAM.md"
 INT64, UINT64 = range(-(2**63), 2**63), range(2**64)
@@ -35,7 +35,7 @@ INSIDE = {
 }
 
 
-class Subscriber:
+class Subscriber(InThread):
     """Hears every kind from a thread of its own, until closed; usable in a `with` block.
 
     Args:
@@ -57,31 +57,13 @@ class Subscriber:
         self._sequence: dict[tuple[str, str], int] = {}
         self._may_miss = may_miss
         self._address = address
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="stream-rules")
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop listening."""
-        self._stopping.set()
-        self._thread.join()
-
-    def __enter__(self) -> Subscriber:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+        super().__init__()
 
     def _run(self) -> None:
-        socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.RCVHWM, 0)
-        socket.setsockopt(zmq.SUBSCRIBE, b"")
-        socket.connect(self._address)
-        while not self._stopping.is_set():
-            if socket.poll(50):
-                self._take(socket.recv_multipart())
-        socket.close()
+        with listening(self._address, b"") as socket:
+            while not self._closing.is_set():
+                if socket.poll(50):
+                    self._take(socket.recv_multipart())
 
     def _take(self, parts: list[bytes]) -> None:
         try:

@@ -6,10 +6,36 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import Self, TypeVar
 
 PATIENCE_S = 60.0
 _T = TypeVar("_T")
+
+
+class InThread:
+    """Runs `_run` in a thread of its own until closed; usable in a `with` block.
+
+    A class that derives from it calls `__init__` last: that starts the thread.
+    """
+
+    def __init__(self) -> None:
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=type(self).__name__)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._closing.set()
+        self._thread.join()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _run(self) -> None:
+        raise NotImplementedError
 
 
 @contextmanager

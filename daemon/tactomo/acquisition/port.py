@@ -13,7 +13,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Collection
-from pathlib import Path
 from typing import Final
 
 from tactomo_models import SensorDescription
@@ -29,7 +28,6 @@ from tactomo_protocol import (
     Scan,
 )
 
-from tactomo.acquisition.adapters import ROOT
 from tactomo.acquisition.companion_log import CompanionLog
 from tactomo.acquisition.connection import Connection
 from tactomo.acquisition.device_clock import MAX_RATE, ClockState, DeviceClock
@@ -86,7 +84,6 @@ class PortReader(Worker):
         recorder: Recorder,  # gets every byte while it records
         deliver: Callable[[Delivery], None],  # called by the thread with what each read brought
         on_event: OnEvent,  # told what happens
-        root: Path = ROOT,  # the folder of `/sys` and `/dev`
         playback: Playback | None = None,  # the replay's time, where the port replays
         # which port carries a channel, of all ports of the sensor; by itself where it is None
         carriers: dict[Channel, PortReader] | None = None,
@@ -113,9 +110,7 @@ class PortReader(Worker):
         self._carriers = {} if carriers is None else carriers
         self._is_replay = url.startswith(f"{REPLAY_SCHEME}://")
         self.connection = (
-            ReplaySource(url, playback)
-            if self._is_replay
-            else Connection(url, baud, on_event, root)
+            ReplaySource(url, playback) if self._is_replay else Connection(url, baud, on_event)
         )
         self._liveness = Liveness(protocol.says_hello, protocol.patience_s)
         self.protocol = protocol
