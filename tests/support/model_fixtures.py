@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from noisy_skin import Skin
 from small_sensor import SMALL
@@ -22,6 +23,7 @@ from tactomo_models.physics.bare_sheet import solve_bare_sheet
 from tactomo_models.physics.compiled_sheet import CompiledSheet
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import mesh_sheet
+from tactomo_models.scene.areas import AreaFinder, Areas
 
 Tared = Callable[..., Reconstructor]
 
@@ -53,6 +55,18 @@ def small(small_file: Path) -> SensorDescription:
 def forward(small: SensorDescription) -> ForwardModel:
     """The small sheet on a coarse mesh."""
     return ForwardModel(small, solve_bare_sheet(small, mesh_sheet(small, refinements=1)))
+
+
+@pytest.fixture(scope="session")
+def two_areas(forward: ForwardModel) -> Areas:
+    """What is pressed in two places of the small sheet."""
+    x, y = forward.bare.points[:, forward.bare.pressable]
+    nearest = np.minimum(np.hypot(x + 0.012, y + 0.006), np.hypot(x - 0.014, y - 0.006))
+    pressed = np.clip(2 - nearest / 0.004, 0, 1)
+    finder = AreaFinder(forward)
+    areas = finder.find(finder.on_map(pressed), pressed)
+    assert len(areas) == 2
+    return areas
 
 
 @pytest.fixture(scope="session")

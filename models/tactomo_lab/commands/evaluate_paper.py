@@ -12,23 +12,13 @@ import typer
 from tactomo.cli import options
 from tactomo.cli.output import table
 
-from tactomo_lab.commands.report import Seeds, chosen_names, shown, tell, usable
+from tactomo_lab.commands.report import Finding, Seeds, chosen_names, shown, tell, usable
 
 if TYPE_CHECKING:
-    from rich.table import Table
     from tactomo.cli.console import Console
     from tactomo_models import Press, SensorDescription
 
     from tactomo_lab.evaluation.play import Outcome
-
-
-class _Part(NamedTuple):
-    """What came out of one experiment."""
-
-    title: str
-    table: Table
-    caption: str
-    facts: Any
 
 
 class _Study(NamedTuple):
@@ -90,7 +80,7 @@ def paper(
             f"on {sheets} uneven sheet(s), one scan a press."
         )
         for part in parts.values():
-            console.print(f"\n{part.title}", style="italic")
+            console.print(f"\n{part.words}", style="italic")
             console.print(part.table)
             console.print(part.caption, style="dim")
 
@@ -102,7 +92,7 @@ def paper(
     tell(told, as_json, show)
 
 
-def _simulation_study(study: _Study) -> _Part:
+def _simulation_study(study: _Study) -> Finding:
     from tactomo_lab.evaluation.paper import COUNTS, SNR_DB, cells, paper_scenes
     from tactomo_lab.evaluation.play import play
 
@@ -121,7 +111,7 @@ def _simulation_study(study: _Study) -> _Part:
             noise = f"{snr_db:g} dB" if math.isfinite(snr_db) else "none"
             made.add_row(noise if method == study.methods[0] else "", method, *values)
         made.add_section()
-    return _Part(
+    return Finding(
         "Fig. 5: error and correlation of the map by number of contacts, simulated",
         made,
         "noise: of the voltages' changes",
@@ -129,7 +119,7 @@ def _simulation_study(study: _Study) -> _Part:
     )
 
 
-def _magnitudes(study: _Study) -> _Part:
+def _magnitudes(study: _Study) -> Finding:
     from tactomo_lab.evaluation.paper import PAPER_MAGNITUDE_ERROR, magnitude_errors, single_areas
 
     outcomes = _pressed(study, single_areas(study.description), "Figs. 8 and 9")
@@ -147,7 +137,7 @@ def _magnitudes(study: _Study) -> _Part:
             _mean_and_deviation([e.of_range for e in of], "{:.0%}"),
             _mean_and_deviation([e.of_contacts for e in of], "{:.0%}"),
         )
-    return _Part(
+    return Finding(
         "Figs. 8 and 9: magnitude error over cases 1 to 4, at its worst pressure",
         made,
         "ours: of the method's own largest estimate, the paper's 0-1 normalisation; of range: of "
@@ -162,7 +152,7 @@ def _magnitudes(study: _Study) -> _Part:
     )
 
 
-def _places(study: _Study) -> _Part:
+def _places(study: _Study) -> Finding:
     from tactomo_lab.evaluation.paper import PAPER_LOCALISATION_MM, locate, places
 
     found = [locate(each) for each in _pressed(study, places(study.description), "Fig. 10")]
@@ -177,7 +167,7 @@ def _places(study: _Study) -> _Part:
             _mean_and_deviation([place.contact_error_mm for place in of], "{:.1f}"),
             f"{sum(place.contacts == 1 for place in of) / len(of):.0%}",
         )
-    return _Part(
+    return Finding(
         "Fig. 10: localisation error in 25 places, mm, mean ± standard deviation",
         made,
         "ours: of the image's mass, as the paper's; contact: of the contact that is reported; "
@@ -192,7 +182,7 @@ def _places(study: _Study) -> _Part:
     )
 
 
-EXPERIMENTS: dict[str, Callable[[_Study], _Part]] = {
+EXPERIMENTS: dict[str, Callable[[_Study], Finding]] = {
     "5": _simulation_study,
     "9": _magnitudes,
     "10": _places,

@@ -6,17 +6,16 @@ from collections.abc import Callable
 from dataclasses import asdict
 from fnmatch import filter as matching
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple
 
 import typer
 from tactomo.cli.options import Description, JsonOutput, examples, typer_app
 from tactomo.cli.output import say, table
 from tactomo.errors import TactomoError
 
-from tactomo_lab.commands.report import shown, tell
+from tactomo_lab.commands.report import Finding, shown, tell
 
 if TYPE_CHECKING:
-    from rich.table import Table
     from tactomo.cli.console import Console
     from tactomo_models import SensorDescription
 
@@ -24,21 +23,12 @@ app = typer_app()
 File = Annotated[Path, typer.Argument(metavar="FILE.npz", help="A set of arrays (format below).")]
 
 
-class Measured(NamedTuple):
-    """What a set shows: its figure, a table with its caption, all for programs."""
-
-    ours: str
-    table: Table
-    caption: str
-    facts: dict[str, Any]
-
-
 class Kind(NamedTuple):
     """A kind of measured sets."""
 
     arrays: tuple[str, ...]  # what sets of the kind are recognised by: patterns of arrays' names
     description: str  # the shipped sensor that public sets are of
-    measure: Callable[[Path, str], Measured]  # what measures a set, of its path and its sensor
+    measure: Callable[[Path, str], Finding]  # what measures a set, of its path and its sensor
 
 
 def _tank_of(sensor: str) -> SensorDescription:
@@ -57,7 +47,7 @@ def _tank_of(sensor: str) -> SensorDescription:
     return description
 
 
-def _saline_tanks(path: Path, sensor: str) -> Measured:
+def _saline_tanks(path: Path, sensor: str) -> Finding:
     """Correlate images of tanks with the truth, by three methods."""
     import numpy as np
     from scipy.stats import spearmanr
@@ -78,7 +68,7 @@ def _saline_tanks(path: Path, sensor: str) -> Measured:
         correlations = (f"{each.correlation:.3f}" for each in one)
         rows.add_row(one[0].name, *correlations, f"{one[0].confidence:.2f}")
     told = ("name", "method", "correlation", "misfit", "confidence", "seconds")
-    return Measured(
+    return Finding(
         "mean correlation with the truth: "
         + ", ".join(f"{name} {mean:.3f}" for name, mean in means.items()),
         rows,
@@ -90,7 +80,7 @@ def _saline_tanks(path: Path, sensor: str) -> Measured:
     )
 
 
-def _round_skin(path: Path, sensor: str) -> Measured:
+def _round_skin(path: Path, sensor: str) -> Finding:
     """Locate a robot's presses by physics and by teaching, cross-validated."""
     import numpy as np
     from tactomo_models import load_description
@@ -108,10 +98,10 @@ def _round_skin(path: Path, sensor: str) -> Measured:
         rows.add_row(name, *(f"{mm:.1f}" for mm in one.values()))
     count = len(presses.changes)
     facts = {"presses": count, "methods": found}
-    return Measured(f"{count} presses located", rows, "Judged in ten folds.", facts)
+    return Finding(f"{count} presses located", rows, "Judged in ten folds.", facts)
 
 
-def _challenge(path: Path, sensor: str, level: int | None = None) -> Measured:
+def _challenge(path: Path, sensor: str, level: int | None = None) -> Finding:
     """Score the challenge's tanks, without the electrodes that a level has lost."""
     from tactomo_lab.evaluation.ktc import evaluate_challenge, read_challenge
 
@@ -127,10 +117,10 @@ def _challenge(path: Path, sensor: str, level: int | None = None) -> Measured:
         rows.add_row(str(number), str(tank.level), str(tank.readings), *figures)
     told = ("level", "readings", "score", "misfit", "seconds")
     each = [{name: getattr(tank, name) for name in told} for tank in tanks]
-    return Measured(f"sum of scores {total:.3f}", rows, "", {"score": total, "tanks": each})
+    return Finding(f"sum of scores {total:.3f}", rows, "", {"score": total, "tanks": each})
 
 
-def _taught_skins(path: Path, sensor: str, train: int = 200) -> Measured:
+def _taught_skins(path: Path, sensor: str, train: int = 200) -> Finding:
     """Learn each skin from its first presses and judge the last; any skin, whatever the sensor."""
     import numpy as np
 
@@ -144,7 +134,7 @@ def _taught_skins(path: Path, sensor: str, train: int = 200) -> Measured:
         shares = (f"{one.within_sigma:.0%}", f"{one.is_taught:.0%}")
         since = " ".join(f"{median:.1f}" for median in one.median_mm_since)
         rows.add_row(one.name, str(one.judged), *errors, *shares, since)
-    return Measured(
+    return Finding(
         f"mean of medians {np.mean([one.median_mm for one in found]):.2f} mm, learnt from the "
         f"first {train} presses of each skin",
         rows,
@@ -163,7 +153,7 @@ KINDS: Final = (
 )
 
 
-def _tell(path: Path, as_json: bool, measure: Callable[[], Measured], of_sets: bool) -> None:
+def _tell(path: Path, as_json: bool, measure: Callable[[], Finding], of_sets: bool) -> None:
     """Measure a set and print what came out; as JSON by its name, where one of several kinds."""
     import scipy.linalg  # noqa: F401  # the limit is of libraries that are loaded
     from threadpoolctl import threadpool_limits
@@ -172,7 +162,7 @@ def _tell(path: Path, as_json: bool, measure: Callable[[], Measured], of_sets: b
         found = measure()
 
     def show(console: Console) -> None:
-        console.print(f"measured, {path.name}: {found.ours}")
+        console.print(f"measured, {path.name}: {found.words}")
         console.print(found.table)
         console.print(found.caption, style="dim")
 

@@ -11,6 +11,7 @@ from tactomo.cli.output import print_json, say, table
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
+    from rich.table import Table
     from tactomo.cli.console import Console
     from tactomo_models import SensorDescription
 
@@ -22,6 +23,15 @@ Seeds = Annotated[
     Literal["tuning", "reporting"],
     typer.Option(help="Tune on the one set of scenes, publish figures of the other."),
 ]
+
+
+class Finding(NamedTuple):
+    """What an evaluation shows: in words, a table with its caption, and all for programs."""
+
+    words: str
+    table: Table
+    caption: str
+    facts: Any
 
 
 class Column(NamedTuple):

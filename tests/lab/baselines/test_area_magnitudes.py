@@ -8,21 +8,9 @@ from measured import measured
 from tactomo_lab.baselines.paper_methods import fit_magnitudes
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.scene.areas import AreaFinder, Areas
+from tactomo_models.scene.areas import Areas
 
 SIGMA = 0.002  # of each voltage's relative change
-
-
-@pytest.fixture(scope="module")
-def two_areas(forward: ForwardModel) -> Areas:
-    x, y = forward.bare.points[:, forward.bare.pressable]
-    discs = ((-0.012, -0.006, 0.006), (0.014, 0.006, 0.005))
-    heights = [1 - np.hypot(x - x_m, y - y_m) / radius / 2 for x_m, y_m, radius in discs]
-    pressed = np.clip(3 * np.max(heights, axis=0) - 1, 0, 1)
-    finder = AreaFinder(forward)
-    areas = finder.find(finder.on_map(pressed), pressed)
-    assert len(areas) == 2
-    return areas
 
 
 def changes(forward: ForwardModel, areas: Areas, change: tuple[float, float]) -> FloatArray:

@@ -15,20 +15,9 @@ from tactomo_models.methods.magnitudes import (
     linear_magnitudes,
 )
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.scene.areas import AreaFinder, Areas
+from tactomo_models.scene.areas import Areas
 
 SIGMA = 0.002  # of each voltage's relative change
-
-
-@pytest.fixture(scope="module")
-def two_areas(forward: ForwardModel) -> Areas:
-    x, y = forward.bare.points[:, forward.bare.pressable]
-    nearest = np.minimum(np.hypot(x + 0.012, y + 0.006), np.hypot(x - 0.014, y - 0.006))
-    pressed = np.clip(2 - nearest / 0.004, 0, 1)
-    finder = AreaFinder(forward)
-    areas = finder.find(finder.on_map(pressed), pressed)
-    assert len(areas) == 2
-    return areas
 
 
 @pytest.fixture(scope="module")
