@@ -14,7 +14,7 @@ import multiprocessing
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from tactomo_models.archive import read_arrays, write_arrays
 from tactomo_models.arrays import FloatArray
 from tactomo_models.errors import DataError, ModelError, os_errors_as
 from tactomo_models.physics.bare_sheet import scan_voltages, transfer_resistances, volts_per_unit
-from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
+from tactomo_models.physics.mesh import SheetMesh, mesh_sheet, part_middles
 from tactomo_models.scene.press import strongest
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.simulation.simulator import conductivity_ratio, smooth_noise
@@ -147,20 +147,11 @@ def _ratio_of(
 ) -> FloatArray:
     """Conductivity of each triangle over what it is at rest, (T,)."""
     corners = mesh.mesh.p[:, mesh.mesh.t]
-    x, y = np.einsum("sk,dkt->dst", _parts(), corners)
+    x, y = np.einsum("sk,dkt->dst", np.stack(part_middles(PARTS), axis=1), corners)
     pressure, coverage = strongest(scene.presses, x, y, SHARP_M)
     ratio = conductivity_ratio(sensor, name, pressure, coverage)
     better = ratio.max() > 1
     return np.asarray(1 / (1 / ratio).mean(axis=0) if better else ratio.mean(axis=0))
-
-
-@lru_cache(maxsize=1)
-def _parts() -> FloatArray:
-    """Barycentric coordinates (parts, 3) of the centroids of a triangle's equal parts."""
-    upright = [(i + 1 / 3, j + 1 / 3) for i in range(PARTS) for j in range(PARTS - i)]
-    turned = [(i + 2 / 3, j + 2 / 3) for i in range(PARTS) for j in range(PARTS - i - 1)]
-    second, third = np.array(upright + turned).T / PARTS
-    return np.stack([1 - second - third, second, third], axis=1)
 
 
 def simulate_some(

@@ -269,15 +269,19 @@ def with_electrodes(mesh: skfem.MeshTri, description: SensorDescription) -> Shee
     return SheetMesh(mesh, tuple(found), tuple(pads))
 
 
-def _under(mesh: skfem.MeshTri, pad: Pad) -> tuple[IntArray, FloatArray]:
-    """Triangles that a pad touches, and what it covers of them; see `SheetMesh.pads`."""
-    pieces = 2**PAD_HALVINGS
+def part_middles(pieces: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Hat functions at the middles of a triangle's equal parts, so many along each side."""
     i, j = np.divmod(np.arange(pieces * pieces), pieces)
     i, j = i[i + j < pieces], j[i + j < pieces]
     down = i + j < pieces - 1  # small triangles the other way up lie between those
     first = np.concatenate([i + 1 / 3, i[down] + 2 / 3]) / pieces
     second = np.concatenate([j + 1 / 3, j[down] + 2 / 3]) / pieces
-    hats = np.stack([1 - first - second, first, second])  # (3, q) at their middles
+    return 1 - first - second, first, second
+
+
+def _under(mesh: skfem.MeshTri, pad: Pad) -> tuple[IntArray, FloatArray]:
+    """Triangles that a pad touches, and what it covers of them; see `SheetMesh.pads`."""
+    hats = np.stack(part_middles(2**PAD_HALVINGS))  # (3, q)
     corners = mesh.p[:, mesh.t]  # (2, 3, T)
     centre = np.array(pad.centre_m)
     size = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=0).max(axis=0)
@@ -286,7 +290,7 @@ def _under(mesh: skfem.MeshTri, pad: Pad) -> tuple[IntArray, FloatArray]:
     places = np.einsum("dct,cq->tdq", corners[:, :, near], hats)
     under = np.linalg.norm(places - centre[:, None], axis=1) < pad.radius_m  # (n, q)
     near, under = near[under.any(axis=1)], under[under.any(axis=1)]
-    shares = np.einsum("tq,aq,bq->tab", under.astype(float), hats, hats) / len(first)
+    shares = np.einsum("tq,aq,bq->tab", under.astype(float), hats, hats) / hats.shape[1]
     _, area = hat_gradients(corners[:, :, near])
     covered = (under.mean(axis=1) * area).sum()
     return near, shares * np.pi * pad.radius_m**2 / covered
