@@ -17,7 +17,7 @@ from tactomo_client import MessageError
 from tactomo_client.messages import MAX_DEPTH, MAX_ENTRIES, decode_message, encode_message
 from tactomo_models import load_description
 from tactomo_models.errors import DescriptionError
-from tactomo_models.sensor.shipped import __path__ as sensors_path
+from tactomo_models.sensor.description_file import shipped_text
 
 POSITION = st.integers(0, 2**16)
 
@@ -161,7 +161,7 @@ def test_what_is_sent_is_within_the_bounds() -> None:
 def test_a_description_cannot_eat_the_machine(
     tmp_path: Path, change: tuple[str, str], said: str
 ) -> None:
-    text = (Path(sensors_path[0]) / "paper_square.toml").read_text("utf-8")
+    text = shipped_text("paper_square")
     assert change[0] in text
     path = tmp_path / "mine.toml"
     path.write_text(text.replace(*change))

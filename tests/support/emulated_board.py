@@ -12,8 +12,8 @@ from tactomo.twin import Twin, TwinConfig
 from tactomo_client import Frame, subscribe
 from tactomo_models import Press, load_description
 from tactomo_models.arrays import FloatArray
-from tactomo_models.sensor.description_file import shipped_text
 from tactomo_protocol import Channel
+from variants import rewritten
 
 COARSE = ("[structure]", "[map]\nnodes_x = 25\nnodes_y = 25\n\n[structure]")
 
@@ -44,13 +44,7 @@ def emulated(
 
 def changed(folder: Path, name: str, *changes: tuple[str, str]) -> str:
     """A shipped description with a coarse map and other changes, as a user would edit it."""
-    text = shipped_text(name)
-    for old, new in (COARSE, *changes):
-        assert old in text
-        text = text.replace(old, new)
-    path = folder / f"{name}.toml"
-    path.write_text(text)
-    return str(path)
+    return str(rewritten(folder / f"{name}.toml", name, COARSE, *changes))
 
 
 def frame_where(daemon: DaemonProcess, condition: Callable[[Frame], bool]) -> Frame:

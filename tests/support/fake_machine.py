@@ -51,14 +51,18 @@ class FakeMachine:
         link.unlink(missing_ok=True)  # of two that are named alike, the last one wins
         self.link(f"dev/serial/by-id/{by_id}", f"dev/{name}")
 
+    def _drive(self, device: str, driver: str) -> None:
+        """Have a driver of the kernel's serve a device."""
+        (self.root / driver).mkdir(parents=True, exist_ok=True)
+        self.link(f"{device}/driver", driver)
+
     def plug_ftdi(self, name: str, socket: str, serial: str, latency_ms: int = 16) -> None:
         """An FT232R: usb-serial, with a latency timer."""
         texts = {"manufacturer": "FTDI", "product": "FT232R USB UART", "serial": serial}
         interface = self._usb(socket, "0403", "6001", **texts)
         port = f"{interface}/{name}"
         self.write(f"{port}/latency_timer", str(latency_ms))
-        (self.root / "sys/bus/usb-serial/drivers/ftdi_sio").mkdir(parents=True, exist_ok=True)
-        self.link(f"{port}/driver", "sys/bus/usb-serial/drivers/ftdi_sio")
+        self._drive(port, "sys/bus/usb-serial/drivers/ftdi_sio")
         by_id = f"usb-FTDI_FT232R_USB_UART_{serial}-if00-port0"
         self._tty(name, port, f"188:{name[-1]}", socket, by_id)
 
@@ -66,25 +70,22 @@ class FakeMachine:
         """A CH340: usb-serial, without a serial number."""
         interface = self._usb(socket, "1a86", "7523", product="USB Serial")
         port = f"{interface}/{name}"
-        (self.root / "sys/bus/usb-serial/drivers/ch341-uart").mkdir(parents=True, exist_ok=True)
-        self.link(f"{port}/driver", "sys/bus/usb-serial/drivers/ch341-uart")
+        self._drive(port, "sys/bus/usb-serial/drivers/ch341-uart")
         self._tty(name, port, f"188:{name[-1]}", socket, "usb-1a86_USB_Serial-if00-port0")
 
     def plug_acm(self, name: str, socket: str, serial: str) -> None:
         """A microcontroller's own USB: cdc_acm, no port device between interface and tty."""
         texts = {"manufacturer": "Tactomo", "product": "Skin", "serial": serial}
         interface = self._usb(socket, "2e8a", "000a", **texts)
-        (self.root / "sys/bus/usb/drivers/cdc_acm").mkdir(parents=True, exist_ok=True)
-        self.link(f"{interface}/driver", "sys/bus/usb/drivers/cdc_acm")
+        self._drive(interface, "sys/bus/usb/drivers/cdc_acm")
         by_id = f"usb-Tactomo_Skin_{serial}-if00"
         self._tty(name, interface, f"166:{name[-1]}", socket, by_id)
 
     def build_in(self, name: str, kind: int) -> None:
         """A UART on the board; of kind 0 where there is none behind the name."""
         device = "sys/devices/pnp0/00:00/00:00:0/00:00:0.0"
-        (self.root / "sys/bus/serial-base/drivers/port").mkdir(parents=True, exist_ok=True)
         if not (self.root / device / "driver").exists():
-            self.link(f"{device}/driver", "sys/bus/serial-base/drivers/port")
+            self._drive(device, "sys/bus/serial-base/drivers/port")
         self.write(f"{device}/tty/{name}/type", str(kind))
         self.link(f"{device}/tty/{name}/device", device)
         self.link(f"sys/class/tty/{name}", f"{device}/tty/{name}")

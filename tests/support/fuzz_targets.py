@@ -72,7 +72,7 @@ from tactomo_models.calibration.load_cell import (
 )
 from tactomo_models.errors import CalibrationError, DataError, DescriptionError
 from tactomo_models.scene.pressure import pressures_of
-from tactomo_models.sensor.shipped import __path__ as sensors_path
+from tactomo_models.sensor.description_file import shipped_text
 from tactomo_protocol import (
     Acknowledge,
     AckStatus,
@@ -208,8 +208,7 @@ def _parse_request(data: bytes) -> bool:
 
 
 def _description_examples() -> list[bytes]:
-    folder = Path(sensors_path[0])
-    return [(folder / f"{name}.toml").read_bytes() for name in shipped_descriptions()]
+    return [shipped_text(name).encode() for name in shipped_descriptions()]
 
 
 def _parse_description(data: bytes) -> bool:

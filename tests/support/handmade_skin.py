@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from tactomo_models import Press, SensorDescription, SkinSimulator, load_description
 from tactomo_models.arrays import FloatArray
+from tactomo_models.sensor.description_file import shipped_text
 from variants import variant
 
 COARSE = {"nodes_x": 25, "nodes_y": 25}
@@ -28,8 +29,7 @@ def described() -> SensorDescription:
 
 def write_description(path: Path) -> Path:
     """The same as a file."""
-    shipped = Path(__file__).parents[2] / "models/tactomo_models/sensor/shipped/paper_square.toml"
-    path.write_text(shipped.read_text("utf-8") + "\n[map]\nnodes_x = 25\nnodes_y = 25\n")
+    path.write_text(shipped_text("paper_square") + "\n[map]\nnodes_x = 25\nnodes_y = 25\n")
     return path
 
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable
-from importlib import resources
 from pathlib import Path
 from typing import Final
 
@@ -22,6 +22,7 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 from tactomo.recordings.recording import Origin
 from tactomo.recordings.recording_writer import RecordingWriter, port_entry
+from tactomo_models.sensor.description_file import shipped_text
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag, encode
 
 MEGABYTE: Final = 1 << 20
@@ -223,12 +224,18 @@ def deep_metadata(path: Path) -> None:
         writer.finish()  # type: ignore[no-untyped-call]
 
 
+def _write_paper_square(path: Path, key: str, value: str) -> None:
+    """The paper's sensor with another value of a key."""
+    text, count = re.subn(
+        f"(?m)^{key} = .*", lambda _: f"{key} = {value}", shipped_text("paper_square")
+    )
+    assert count == 1
+    path.write_text(text)
+
+
 def wide_description(path: Path) -> None:
     """A sheet 3 m wide: the largest mesh that its map's nodes seem to allow."""
-    text = (resources.files("tactomo_models.sensor.shipped") / "paper_square.toml").read_text()
-    lines = ["width_m = 3.0" if line.startswith("width_m") else line for line in text.splitlines()]
-    assert lines.count("width_m = 3.0") == 1
-    path.write_text("\n".join(lines))
+    _write_paper_square(path, "width_m", "3.0")
 
 
 def deep_toml(path: Path) -> None:
@@ -243,12 +250,7 @@ def dotted_toml(path: Path) -> None:
 
 def titled_description(path: Path) -> None:
     """A description whose title is markup and whose name is none."""
-    text = (resources.files("tactomo_models.sensor.shipped") / "paper_square.toml").read_text()
-    lines = [
-        f'title = "{BAD_DEVICE} \\u001b[2J"' if line.startswith("title") else line
-        for line in text.splitlines()
-    ]
-    path.write_text("\n".join(lines))
+    _write_paper_square(path, "title", f'"{BAD_DEVICE} \\u001b[2J"')
 
 
 def deep_json(path: Path) -> None:

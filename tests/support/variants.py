@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from tactomo_models import SensorDescription
+from tactomo_models.sensor.description_file import shipped_text
 
 
 def variant(description: SensorDescription, **sections: dict[str, Any] | None) -> SensorDescription:
@@ -16,3 +18,13 @@ def variant(description: SensorDescription, **sections: dict[str, Any] | None) -
         if changes is None:
             del raw[name]
     return SensorDescription.model_validate(raw)
+
+
+def rewritten(path: Path, name: str, *changes: tuple[str, str]) -> Path:
+    """Write a shipped description with parts in other words, as a user would edit it."""
+    text = shipped_text(name)
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path.write_text(text)
+    return path

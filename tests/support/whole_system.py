@@ -17,7 +17,7 @@ import pytest
 from daemon_process import DaemonProcess
 from tactomo.cli.children import Family
 from tactomo_client import Frame, request, subscribe
-from tactomo_models.sensor.description_file import shipped_text
+from variants import rewritten
 from waiting import PATIENCE_S, wait_until
 
 SENSOR = "left_forearm"
@@ -118,12 +118,7 @@ class WatchedTwin:
 @contextmanager
 def paper_twin(folder: Path, *changes: tuple[str, str]) -> Iterator[dict[str, list[str]]]:
     """Run `tactomo twin` of the paper's sensor with parts of its description in other words."""
-    text = shipped_text("paper_square")
-    for old, new in changes:
-        assert text.count(old) == 1
-        text = text.replace(old, new)
-    description = folder / "otherwise.toml"
-    description.write_text(text)
+    description = rewritten(folder / "otherwise.toml", "paper_square", *changes)
     with twin_of(description, folder / "ports") as said:
         yield said
 

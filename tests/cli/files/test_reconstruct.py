@@ -18,14 +18,19 @@ from tactomo_protocol import Channel
 from typer.testing import CliRunner
 
 
+def write_scans(path: Path, *presses: Press | None, spacing_m: float | None = None) -> None:
+    """A scan of each press, without noise, and the reference."""
+    skin = SkinSimulator(load_description("paper_square"), spacing_m)
+    taken = [skin.voltages([press] if press else []) for press in presses]
+    empty = skin.voltages([])
+    references = {f"{name}_reference": volts for name, volts in empty.items()}
+    scans = {str(name): np.stack([volts[name] for volts in taken]) for name in empty}
+    np.savez(path, **scans, **references)  # type: ignore[arg-type]
+
+
 @pytest.mark.slow
 def test_a_press_is_found_in_a_file(tactomo: Run, tmp_path: Path) -> None:
-    skin = SkinSimulator(load_description("paper_square"))
-    empty = skin.voltages([])
-    pressed = skin.voltages([Press(x_m=-0.03, y_m=0.03, pressure_kpa=180.0)])
-    scans = {name: np.stack([empty[name], pressed[name]]) for name in empty}
-    references = {f"{name}_reference": volts for name, volts in empty.items()}
-    np.savez(tmp_path / "in.npz", **scans, **references)  # type: ignore[arg-type]
+    write_scans(tmp_path / "in.npz", None, Press(x_m=-0.03, y_m=0.03, pressure_kpa=180.0))
     result = tactomo("reconstruct", "in.npz", "out.npz", status=0)
     assert "wrote out.npz: 2 frames\nno frame is flagged\n" in result.stdout
     assert re.search(r"1 +-30\.\d +\d\d\.\d .* 18\d ± \d kPa", result.stdout)
@@ -98,12 +103,7 @@ def test_companions_of_a_file_are_judged_in_every_layout(
 @pytest.mark.slow
 def test_a_calibration_says_how_hard_is_pressed(tactomo: Run, tmp_path: Path) -> None:
     sensor = load_description("paper_square")
-    skin = SkinSimulator(sensor)
-    empty = skin.voltages([])
-    pressed = skin.voltages([Press(x_m=-0.03, y_m=0.03, pressure_kpa=180.0)])
-    references = {f"{name}_reference": volts for name, volts in empty.items()}
-    scans = {str(name): volts[None] for name, volts in pressed.items()}
-    np.savez(tmp_path / "in.npz", **scans, **references)  # type: ignore[arg-type]
+    write_scans(tmp_path / "in.npz", Press(x_m=-0.03, y_m=0.03, pressure_kpa=180.0))
     readings = [
         Reading(pressure_kpa=kpa, magnitude=max(0.0, (kpa - 50) * 2e-3))
         for kpa in (20.0, 60.0, 80.0, 100.0, 130.0, 160.0)
@@ -121,12 +121,7 @@ def test_a_calibration_says_how_hard_is_pressed(tactomo: Run, tmp_path: Path) ->
 
 @pytest.mark.slow
 def test_every_method_can_be_asked_for(tmp_path: Path) -> None:
-    skin = SkinSimulator(load_description("paper_square"))
-    empty = skin.voltages([])
-    pressed = skin.voltages([Press(x_m=0.03, y_m=-0.02, pressure_kpa=180.0)])
-    references = {f"{name}_reference": volts for name, volts in empty.items()}
-    scans = {str(name): volts[None] for name, volts in pressed.items()}
-    np.savez(tmp_path / "in.npz", **scans, **references)  # type: ignore[arg-type]
+    write_scans(tmp_path / "in.npz", Press(x_m=0.03, y_m=-0.02, pressure_kpa=180.0))
     maps = {}
     for method in available_methods():
         source, target = tmp_path / "in.npz", tmp_path / f"{method}.npz"
@@ -183,15 +178,8 @@ def test_bad_scans_are_flagged_in_the_file(tactomo: Run, tmp_path: Path) -> None
     assert flags[5] & (Flag.NOISE_HIGH | Flag.STRUCTURE_MISSING)
 
 
-def scans_file(path: Path) -> None:
-    rest = SkinSimulator(load_description("paper_square"), spacing_m=0.008).voltages([])
-    references = {f"{name}_reference": volts for name, volts in rest.items()}
-    scans = {str(name): np.stack([volts, volts]) for name, volts in rest.items()}
-    np.savez(path, **scans, **references)  # type: ignore[arg-type]
-
-
 def test_flags_are_told_in_words(tactomo: Run, tmp_path: Path) -> None:
-    scans_file(tmp_path / "in.npz")
+    write_scans(tmp_path / "in.npz", None, None, spacing_m=0.008)
     with np.load(tmp_path / "in.npz") as arrays:
         one = {name: array for name, array in arrays.items() if "structure" not in name}
     np.savez(tmp_path / "one.npz", **one)
@@ -205,7 +193,7 @@ def test_flags_are_told_in_words(tactomo: Run, tmp_path: Path) -> None:
 def test_methods_are_drawn_side_by_side(
     tactomo: Run, tmp_path: Path, methods: tuple[str, ...]
 ) -> None:
-    scans_file(tmp_path / "in.npz")
+    write_scans(tmp_path / "in.npz", None, None, spacing_m=0.008)
     named = [word for name in methods for word in ("--method", name)]
     result = tactomo("reconstruct", "in.npz", "out.npz", *named, "--picture", "maps.svg", status=0)
     assert "wrote maps.svg" in result.stdout
@@ -214,7 +202,7 @@ def test_methods_are_drawn_side_by_side(
 
 
 def test_only_its_own_output_is_written_over_unasked(tactomo: Run, tmp_path: Path) -> None:
-    scans_file(tmp_path / "in.npz")
+    write_scans(tmp_path / "in.npz", None, None, spacing_m=0.008)
     scans = (tmp_path / "in.npz").read_bytes()
     command = ("reconstruct", "in.npz", "out.npz", "--method", "tikhonov")
     tactomo(*command, status=0)
@@ -228,7 +216,7 @@ def test_only_its_own_output_is_written_over_unasked(tactomo: Run, tmp_path: Pat
 
 
 def test_what_is_no_file_is_not_replaced_by_one(tactomo: Run, tmp_path: Path) -> None:
-    scans_file(tmp_path / "in.npz")
+    write_scans(tmp_path / "in.npz", None, None, spacing_m=0.008)
     (tmp_path / "nothing").symlink_to("/dev/null")
     command = ("reconstruct", "in.npz", "nothing", "--method", "tikhonov")
     tactomo(*command, status=0)
@@ -239,7 +227,7 @@ def test_what_is_no_file_is_not_replaced_by_one(tactomo: Run, tmp_path: Path) ->
 def test_half_a_file_is_never_left(
     tactomo: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scans_file(tmp_path / "in.npz")
+    write_scans(tmp_path / "in.npz", None, None, spacing_m=0.008)
 
     def interrupted(_: object, file: Any, *__: Any) -> None:
         file.write(b"half of it")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from tactomo.errors import ConfigError
 from tactomo.protocols import protocol_named, recognised
 from tactomo.protocols.sciospec import DATA, Sciospec, requests
 from tactomo_models import SensorDescription, load_description
+from tactomo_models.sensor.description_file import shipped_text
 from tactomo_protocol import Channel, Hello, Packet, Scan
 
 TANK = load_description("tank_disc")
@@ -25,11 +25,7 @@ ACK, NACK = b"\x18\x01\x83\x18", b"\x18\x01\x81\x18"
 
 def sensor(folder: Path, **changes: str) -> SensorDescription:
     """Return the round tank with lines of its description exchanged."""
-    text = (
-        resources.files("tactomo_models.sensor.shipped")
-        .joinpath("tank_disc.toml")
-        .read_text("utf-8")
-    )
+    text = shipped_text("tank_disc")
     for line, new in changes.items():
         old = next(each for each in text.splitlines() if each.startswith(line))
         text = text.replace(old, new)

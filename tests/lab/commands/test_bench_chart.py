@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from importlib import resources
 from itertools import combinations
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from tactomo_lab.evaluation.play import Variant
 from tactomo_lab.evaluation.trade_off import Point
 from tactomo_lab.scenes.measures import summarise
 from tactomo_models import available_methods
+from tactomo_models.sensor.description_file import shipped_text
 
 
 def point(method: str, p50_s: float, icc: float, budget_s: float | None = None) -> Point:
@@ -113,9 +113,8 @@ def test_what_cannot_be_written_is_refused_before_the_work(
 @pytest.mark.timeout(600)
 def test_the_whole_chart(tactomo: Run, tmp_path: Path) -> None:
     """On a coarse map, so that scenes are simulated in seconds."""
-    shipped = resources.files("tactomo_models.sensor.shipped").joinpath("paper_square.toml")
     sensor = tmp_path / "coarse.toml"
-    sensor.write_text(shipped.read_text("utf-8") + "[map]\nnodes_x = 21\nnodes_y = 21\n")
+    sensor.write_text(shipped_text("paper_square") + "[map]\nnodes_x = 21\nnodes_y = 21\n")
     result = tactomo(
         "bench", "--chart", "chart.png", "--count", 1, "--json", "-d", sensor, status=0
     )

@@ -13,18 +13,14 @@ from fixture_types import Run
 from shared_data import measured
 from simulated_tanks import simulated_tanks
 from tactomo_models import load_description
+from tactomo_models.sensor.description_file import shipped_text
 
 
 @pytest.fixture
 def tank(tmp_path: Path) -> Path:
     """A smaller map, so that the model is built in a second."""
-    from importlib import resources
-
-    text = (
-        resources.files("tactomo_models.sensor.shipped").joinpath("tank_uef2017.toml").read_text()
-    )
     path = tmp_path / "tank.toml"
-    path.write_text(text + "\n[map]\nnodes_x = 25\nnodes_y = 25\n")
+    path.write_text(shipped_text("tank_uef2017") + "\n[map]\nnodes_x = 25\nnodes_y = 25\n")
     return path
 
 

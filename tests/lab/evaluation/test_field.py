@@ -54,15 +54,19 @@ def test_a_moving_scene_is_scored_where_no_scan_is_lost(small: SensorDescription
     assert 0 < summarise(frames).icc < 1
 
 
-def test_ordinary_scenes_are_the_same_ones_at_each_noise(small: SensorDescription) -> None:
-    quiet, noisy, noisiest = one_of(small, "ordinary").values()
-    assert quiet.frames[0].presses == noisy.frames[0].presses == noisiest.frames[0].presses
-    assert [case.plan.snr_db for case in (quiet, noisy, noisiest)] == [40, 20, 10]
+def assert_ten_times_as_noisy(noisy: Case, quiet: Case) -> None:
     assert quiet.tare.magnitude_noise is not None
     assert noisy.tare.magnitude_noise is not None
     np.testing.assert_allclose(
         noisy.tare.magnitude_noise / quiet.tare.magnitude_noise, 10, rtol=1e-6
     )
+
+
+def test_ordinary_scenes_are_the_same_ones_at_each_noise(small: SensorDescription) -> None:
+    quiet, noisy, noisiest = one_of(small, "ordinary").values()
+    assert quiet.frames[0].presses == noisy.frames[0].presses == noisiest.frames[0].presses
+    assert [case.plan.snr_db for case in (quiet, noisy, noisiest)] == [40, 20, 10]
+    assert_ten_times_as_noisy(noisy, quiet)
 
 
 def test_a_regime_is_measured_at_its_own_noise_or_of_the_change(small: SensorDescription) -> None:
@@ -72,11 +76,7 @@ def test_a_regime_is_measured_at_its_own_noise_or_of_the_change(small: SensorDes
     assert own.plan.frames == quiet.plan.frames == noisy.plan.frames
     told = [(case.plan.snr_db, case.plan.snr_of) for case in (own, quiet, noisy)]
     assert told == [(60, "voltage"), (40, "change"), (20, "change")]
-    assert quiet.tare.magnitude_noise is not None
-    assert noisy.tare.magnitude_noise is not None
-    np.testing.assert_allclose(
-        noisy.tare.magnitude_noise / quiet.tare.magnitude_noise, 10, rtol=1e-6
-    )
+    assert_ten_times_as_noisy(noisy, quiet)
 
 
 def test_one_graded_sheet_has_no_structure_scan(small: SensorDescription) -> None:

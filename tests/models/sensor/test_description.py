@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_sensor import SMALL
 from tactomo_models import DescriptionError, SensorDescription, load_description
-from tactomo_models.sensor.description_file import shipped_descriptions
+from tactomo_models.sensor.description_file import shipped_descriptions, shipped_text
 from tactomo_models.sensor.pattern import scan_pairs
 from variants import variant
 
@@ -154,7 +153,7 @@ def test_an_error_repeats_no_more_than_a_line_of_what_a_file_says(tmp_path: Path
 
 
 def test_a_disc_takes_a_count_and_no_pitch(tmp_path: Path) -> None:
-    text = (resources.files("tactomo_models.sensor.shipped") / "tank_disc.toml").read_text("utf-8")
+    text = shipped_text("tank_disc")
     file = tmp_path / "disc.toml"
     for key, wrong, said in [
         (

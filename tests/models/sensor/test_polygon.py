@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tactomo_models import DescriptionError, SensorDescription, load_description
+from tactomo_models.sensor.description_file import shipped_text
 from tactomo_models.sensor.outline import Pad
 from variants import variant
 
@@ -113,9 +114,7 @@ def test_electrodes_that_lie_nowhere_are_refused_by_name(
 
 def test_a_list_in_millimetres_is_one_complaint_that_says_so(tmp_path: Path) -> None:
     file = tmp_path / "mm.toml"
-    text = (
-        Path(__file__).parents[3] / "models/tactomo_models/sensor/shipped/palm_l.toml"
-    ).read_text("utf-8")
+    text = shipped_text("palm_l")
     file.write_text(text.replace("-0.06, -0.06", "-60, -60").replace("-0.06, 0.06", "-60, 60"))
     said = r"outline_m\.0\.0 = -60.*in millimetres\? -60 mm are -0.06 m \(and 3 more of this list\)"
     with pytest.raises(DescriptionError, match=said) as refused:
