@@ -191,6 +191,43 @@ def test_wrong_usage_exits_with_2(tactomo: Run, arguments: list[str]) -> None:
     assert result.stdout == ""
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["export", GOLDEN, "frames.csv", "--from"],
+        ["plot", GOLDEN, "--to"],
+        ["replay", GOLDEN, "--start"],
+    ],
+    ids=lambda words: f"{words[0]} {words[-1]}",
+)
+@pytest.mark.parametrize("number", ["nan", "inf", "-inf"])
+def test_no_option_takes_a_number_without_end(words: list[str], number: str) -> None:
+    result = CliRunner().invoke(app, [*words, number], prog_name="tactomo")
+    assert result.exit_code == 2, result.output
+
+
+LONG = "x" * 5000
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["info", LONG],
+        ["reconstruct", LONG, "maps.npz"],
+        ["import", LONG, "scans.mcap"],
+        ["recover", GOLDEN, "-o", LONG],
+        ["status", "-a", "tcp://127.0.0.1:1", "--keys", LONG],
+        ["watch", "--address", "\udce9"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_path_or_address_that_cannot_be_is_told(tactomo: Run, words: list[str]) -> None:
+    result = tactomo(*words)
+    assert result.returncode in (1, 2)
+    assert "Traceback" not in result.stderr
+    assert re.search("name too long|it is no text", result.stderr), result.stderr[-300:]
+
+
 def test_the_default_addresses_are_the_clients() -> None:
     assert messages.DEFAULT_STREAM == DEFAULT_STREAM
     assert messages.DEFAULT_CONTROL == DEFAULT_CONTROL

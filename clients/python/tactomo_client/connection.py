@@ -79,10 +79,11 @@ class Connection:
         """
         try:
             self.socket.connect(self.address)
-        except zmq.ZMQError as error:
+        except (zmq.ZMQError, UnicodeError) as error:
             self.close()
+            reason = error.strerror if isinstance(error, zmq.ZMQError) else "it is no text"
             raise ControlError(
-                f"cannot connect to {self.address!r}: {error.strerror}",
+                f"cannot connect to {self.address!r}: {reason}",
                 "an address looks like tcp://127.0.0.1:5560 (the stream), tcp://127.0.0.1:5561 "
                 "(the control socket) or ipc:///run/tactomo/stream",
                 "bad_address",

@@ -14,7 +14,9 @@ several commands gives the one of that name; one without it becomes a group of t
 
 from __future__ import annotations
 
+import copy
 import functools
+import math
 from collections.abc import Iterator, Mapping
 from importlib import import_module
 from typing import Annotated, Any, NamedTuple
@@ -88,7 +90,26 @@ def _build(name: str, app: typer.Typer) -> Any:
     command: Any = get_command(app)
     command = getattr(command, "commands", {}).get(name, command)
     command.name = name
+    _refuse_endless(command)
     return command
+
+
+def _refuse_endless(command: Any) -> None:
+    """Have a command take finite numbers alone: bounds of an option let NaN through."""
+    below = getattr(command, "commands", {})
+    for each in (below.built if isinstance(below, _Commands) else below).values():
+        _refuse_endless(each)
+    for parameter in command.params:
+        if parameter.type.name.startswith("float"):
+            parameter.type = copy.copy(parameter.type)
+            parameter.type.convert = functools.partial(_finite, parameter.type.convert)
+
+
+def _finite(convert: Any, value: Any, parameter: Any, context: Any) -> float:
+    number: float = convert(value, parameter, context)
+    if not math.isfinite(number):
+        raise typer.BadParameter(f"{value!r} is not a finite number", context, parameter)
+    return number
 
 
 class _Commands(Mapping[str, Any]):
@@ -100,18 +121,18 @@ class _Commands(Mapping[str, Any]):
         built: Mapping[str, Any],  # those that its Typer holds
     ) -> None:
         self._group = group
-        self._built = dict(built)
+        self.built = dict(built)
 
     def __getitem__(self, name: str) -> Any:
-        if name not in self._built:
-            self._built[name] = _build(name, self._load(name))
-        return self._built[name]
+        if name not in self.built:
+            self.built[name] = _build(name, self._load(name))
+        return self.built[name]
 
     def __iter__(self) -> Iterator[str]:
         points = [p.removeprefix(self._group) for p in _entry_points() if self._holds(p)]
         lines = () if self._group else COMMANDS.values()
         ours = [line.name for line in lines if line.module or line.name in points]
-        return iter(dict.fromkeys([*ours, *self._built, *sorted(points)]))
+        return iter(dict.fromkeys([*ours, *self.built, *sorted(points)]))
 
     def __len__(self) -> int:
         return len(list(iter(self)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 
@@ -19,4 +20,8 @@ def explain(error: BaseException) -> str | None:
         kind = getattr(sys.modules.get(module), name, None)
         if kind is not None and isinstance(error, kind):
             return str(error)
+    # Whatever a path is asked for: it is too long, or lies in a folder that others may not enter.
+    if isinstance(error, OSError) and error.filename is not None:
+        path = os.fsdecode(error.filename)
+        return f"cannot use {path}: {error.strerror}; give a path that you may read, or write to"
     return None
