@@ -206,6 +206,17 @@ def test_no_option_takes_a_number_without_end(words: list[str], number: str) -> 
     assert result.exit_code == 2, result.output
 
 
+@pytest.mark.parametrize(
+    "words", [["recover", GOLDEN], ["calibrate", "live"], ["teach", "live"]], ids=" ".join
+)
+@pytest.mark.parametrize("folder", ["", ".", "/"])
+def test_a_folder_is_no_file_to_write(words: list[str], folder: str) -> None:
+    """An empty variable of a shell's is the folder that one is in."""
+    result = CliRunner().invoke(app, [*words, "-o", folder], prog_name="tactomo")
+    assert result.exit_code == 2, result.output
+    assert "is a directory" in result.output or "the path is empty" in result.output
+
+
 LONG = "x" * 5000
 
 
@@ -226,6 +237,15 @@ def test_a_path_or_address_that_cannot_be_is_told(tactomo: Run, words: list[str]
     assert result.returncode in (1, 2)
     assert "Traceback" not in result.stderr
     assert re.search("name too long|it is no text", result.stderr), result.stderr[-300:]
+
+
+def test_what_cannot_be_written_to_is_told() -> None:
+    """A disk that the output was directed to is full."""
+    program = [sys.executable, "-m", "tactomo.cli", "info", GOLDEN, "--json"]
+    with Path("/dev/full").open("wb") as full:
+        result = subprocess.run(program, stdout=full, stderr=subprocess.PIPE, check=False)
+    assert (result.returncode, b"Traceback" in result.stderr) == (1, False), result.stderr
+    assert b"No space left" in result.stderr
 
 
 def test_the_default_addresses_are_the_clients() -> None:

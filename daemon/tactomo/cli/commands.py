@@ -17,6 +17,7 @@ from __future__ import annotations
 import copy
 import functools
 import math
+import os
 from collections.abc import Iterator, Mapping
 from importlib import import_module
 from typing import Annotated, Any, NamedTuple
@@ -90,26 +91,27 @@ def _build(name: str, app: typer.Typer) -> Any:
     command: Any = get_command(app)
     command = getattr(command, "commands", {}).get(name, command)
     command.name = name
-    _refuse_endless(command)
+    _refuse_nonsense(command)
     return command
 
 
-def _refuse_endless(command: Any) -> None:
-    """Have a command take finite numbers alone: bounds of an option let NaN through."""
+def _refuse_nonsense(command: Any) -> None:
+    """Have a command refuse what types let through: numbers without end, and paths without name."""
     below = getattr(command, "commands", {})
     for each in (below.built if isinstance(below, _Commands) else below).values():
-        _refuse_endless(each)
+        _refuse_nonsense(each)
     for parameter in command.params:
-        if parameter.type.name.startswith("float"):
-            parameter.type = copy.copy(parameter.type)
-            parameter.type.convert = functools.partial(_finite, parameter.type.convert)
+        parameter.type = copy.copy(parameter.type)
+        parameter.type.convert = functools.partial(_checked, parameter.type.convert)
 
 
-def _finite(convert: Any, value: Any, parameter: Any, context: Any) -> float:
-    number: float = convert(value, parameter, context)
-    if not math.isfinite(number):
+def _checked(convert: Any, value: Any, parameter: Any, context: Any) -> Any:
+    made = convert(value, parameter, context)
+    if isinstance(made, float) and not math.isfinite(made):
         raise typer.BadParameter(f"{value!r} is not a finite number", context, parameter)
-    return number
+    if parameter is not None and parameter.type.name in ("path", "file") and not os.fspath(value):
+        raise typer.BadParameter("the path is empty", context, parameter)
+    return made
 
 
 class _Commands(Mapping[str, Any]):

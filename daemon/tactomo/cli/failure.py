@@ -20,8 +20,9 @@ def explain(error: BaseException) -> str | None:
         kind = getattr(sys.modules.get(module), name, None)
         if kind is not None and isinstance(error, kind):
             return str(error)
-    # Whatever a path is asked for: it is too long, or lies in a folder that others may not enter.
-    if isinstance(error, OSError) and error.filename is not None:
-        path = os.fsdecode(error.filename)
-        return f"cannot use {path}: {error.strerror}; give a path that you may read, or write to"
+    # What the system refuses is no mistake of ours: a path, a disk that is full or that fails.
+    if isinstance(error, OSError) and error.strerror:
+        name = error.filename
+        what = "read or write" if name is None else f"use {os.fsdecode(name)}"
+        return f"cannot {what}: {error.strerror}; check the path, and the disk that it is on"
     return None

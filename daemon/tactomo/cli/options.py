@@ -194,7 +194,9 @@ TwinPorts: TypeAlias = Annotated[
 Rate: TypeAlias = Annotated[float, typer.Option(help="Dual scans a second.")]
 KeptFile: TypeAlias = Annotated[
     Path | None,
-    typer.Option("--output", "-o", help="Keep it in this file. [where the daemon looks]"),
+    typer.Option(
+        "--output", "-o", dir_okay=False, help="Keep it in this file. [where the daemon looks]"
+    ),
 ]
 DryRun: TypeAlias = Annotated[bool, typer.Option("--dry-run", help="Do not keep the result.")]
 ShownFile: TypeAlias = Annotated[

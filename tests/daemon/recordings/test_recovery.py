@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import os
 import random
 from pathlib import Path
 from typing import Any
@@ -168,6 +169,14 @@ def test_a_whole_recording_is_copied(tmp_path: Path) -> None:
     assert scan_counters(output) == list(range(SCANS))
     assert open_recording(output).origin == ORIGIN
     assert messages(output) == messages(tmp_path / "damaged.mcap")
+
+
+def test_a_name_that_is_no_text_is_as_good_as_another(tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"\xe9")
+    folder.mkdir()
+    damaged = folder / os.fsdecode(b"\xe9.mcap")
+    damaged.write_bytes(whole())
+    assert recover(damaged, tmp_path / "out.mcap").is_intact
 
 
 def test_frames_whose_calibration_is_lost_are_absent(tmp_path: Path) -> None:

@@ -24,7 +24,9 @@ def recover(
     recording: RecordingFile,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="The new file. [FILE-recovered.mcap beside it]"),
+        typer.Option(
+            "--output", "-o", dir_okay=False, help="The new file. [FILE-recovered.mcap beside it]"
+        ),
     ] = None,
 ) -> None:
     """Rewrite a cut or damaged recording with an index, so that any MCAP tool opens it.
