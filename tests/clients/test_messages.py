@@ -208,3 +208,13 @@ def test_a_request_in_which_a_key_comes_twice_is_none(pairs: list[tuple[str, Any
     pack([("schema", 1), *pairs])
     with pytest.raises(MessageError, match="a key comes twice"):
         decode_request(packer.bytes())
+
+
+def test_a_name_that_is_no_text_holds_back_no_message() -> None:
+    """A port, a folder or a file may have any bytes in its name; a command's may not."""
+    name = b"/dev/\xe9".decode("utf-8", "surrogateescape")
+    sent = decode_message(encode_message("left", "event", {**HEADER, "detail": name}))
+    assert sent.fields["detail"] == "/dev/?"
+    assert decode_reply(encode_reply({"path": name})) == {"path": "/dev/?"}
+    with pytest.raises(MessageError):
+        encode_request("record_start", {"path": name})

@@ -85,7 +85,7 @@ def encode_message(sensor: str, kind: str, fields: Mapping[str, Any]) -> bytes:
     """
     head = topic(sensor, kind)
     _check_header(fields)
-    return head + _pack({"schema": SCHEMA, "sensor": sensor, "kind": kind, **fields})
+    return head + _pack({"schema": SCHEMA, "sensor": sensor, "kind": kind, **fields}, "replace")
 
 
 def decode_message(data: bytes) -> Message:
@@ -136,13 +136,13 @@ def decode_request(data: bytes) -> tuple[str, dict[str, Any]]:
 
 def encode_reply(result: Mapping[str, Any]) -> bytes:
     """Return the bytes of the reply to a command that was carried out."""
-    return _pack({"schema": SCHEMA, "ok": True, "result": dict(result)})
+    return _pack({"schema": SCHEMA, "ok": True, "result": dict(result)}, "replace")
 
 
 def encode_error(name: str, cause: str, next_step: str = "") -> bytes:
     """Return the bytes of the reply to a command that was not carried out."""
     error = {"name": name, "cause": cause, "next_step": next_step}
-    return _pack({"schema": SCHEMA, "ok": False, "error": error})
+    return _pack({"schema": SCHEMA, "ok": False, "error": error}, "replace")
 
 
 def decode_reply(data: bytes) -> dict[str, Any]:
@@ -163,9 +163,10 @@ def decode_reply(data: bytes) -> dict[str, Any]:
     raise MessageError("a reply is {schema, ok: true, result} or {schema, ok: false, error}")
 
 
-def _pack(fields: Mapping[str, Any]) -> bytes:
+def _pack(fields: Mapping[str, Any], no_text: str = "strict") -> bytes:
+    """Return what goes onto the wire; `no_text` says what becomes of a name that is no text."""
     try:
-        data: bytes = msgpack.packb(fields, default=_numpy_to_wire)
+        data: bytes = msgpack.packb(fields, default=_numpy_to_wire, unicode_errors=no_text)
     except MessageError:
         raise
     except (TypeError, ValueError, OverflowError, RecursionError) as error:

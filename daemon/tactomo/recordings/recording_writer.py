@@ -164,7 +164,7 @@ class RecordingWriter:
     def _begin(self, origin: Origin) -> None:
         self._writer.start(profile=PROFILE, library=f"tactomo {origin.version}")
         metadata = {**asdict(origin), "ports": "\n".join(origin.ports)}
-        self._writer.add_metadata(PROFILE, metadata)
+        self._writer.add_metadata(PROFILE, _as_text(metadata))
         # Always the same ones in the same order: should the chunk that names them be lost, what
         # the others hold is known by number.
         self._channels = {
@@ -197,7 +197,7 @@ class RecordingWriter:
     def note(self, name: str, facts: dict[str, str]) -> None:
         """Add a metadata record, after the chunks: between them it would pass for a gap."""
         self._end_chunk()
-        self._writer.add_metadata(name, facts)
+        self._writer.add_metadata(name, _as_text(facts))
 
     def flush(self) -> int:
         """Hand everything to the operating system, which outlives this process; return the size."""
@@ -302,3 +302,8 @@ def write_recording(
         raise RecordingError(
             f"cannot write {path}: {error.strerror}", "make room on the disk", "cannot_write"
         ) from error
+
+
+def _as_text(facts: dict[str, str]) -> dict[str, str]:
+    """Facts whose values have bytes of a file's name that are no text: each becomes a question."""
+    return {name: value.encode("utf-8", "replace").decode() for name, value in facts.items()}

@@ -140,8 +140,7 @@ class _Salvage:
         try:
             self._keep_chunks()
             gaps = len(self.recovery.gaps) + self.recovery.is_cut
-            name = os.fsencode(self._file.name).decode("utf-8", "replace")  # a name is any bytes
-            self._writer.note(RECOVERED, {"gaps": str(gaps), "from": name})
+            self._writer.note(RECOVERED, {"gaps": str(gaps), "from": self._file.name})
             self._writer.close()
         finally:
             self._writer.abandon()
