@@ -196,6 +196,7 @@ def test_wrong_usage_exits_with_2(tactomo: Run, arguments: list[str]) -> None:
     [
         ["export", GOLDEN, "frames.csv", "--from"],
         ["plot", GOLDEN, "--to"],
+        ["import", "scans.npz", "scans.mcap", "--rate"],
         ["replay", GOLDEN, "--start"],
     ],
     ids=lambda words: f"{words[0]} {words[-1]}",

@@ -152,10 +152,7 @@ def test_readings_of_companions_are_kept(tactomo: Run, tmp_path: Path) -> None:
     [
         ({"magnitude": np.zeros((4, 207))}, ["--rate", "1"], "real numbers of shape T x 208"),
         ({"magnitude": np.zeros((4, 208))}, [], "give --rate"),
-        *(
-            ({"magnitude": np.zeros((4, 208))}, ["--rate", rate], "are no device's")
-            for rate in ("inf", "nan", "1e308")
-        ),
+        ({"magnitude": np.zeros((4, 208))}, ["--rate", "1e308"], "are no device's"),
         (
             {"magnitude": np.zeros((4, 208)), "structure": np.zeros((3, 208))},
             ["--rate", "1"],
