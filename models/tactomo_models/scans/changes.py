@@ -13,18 +13,12 @@ from functools import cached_property
 import numpy as np
 from tactomo_protocol import Channel
 
-from tactomo_models.arrays import FloatArray
+from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.physics.compiled_sheet import CompiledData
 from tactomo_models.scans.frame_noise import CERTAIN
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.sensor.description import SensorDescription
 
-# An uneven sheet has few degrees of freedom: errors of the model go together, about as many
-# voltages at a time, and average out so much less than noise does. Correlation of the map on tuning
-# rows with 2, 4 and 10: mixed 0.984 each; ordinary, 40 dB 0.987, 0.986, 0.982; rectangles and rings
-# 0.984, 0.986, 0.982; crowds 0.978, 0.981, 0.970; soft on hand-made skins 0.963, 0.962, 0.958, and
-# 48, 56 and 67 % of the places there within one sigma.
-CORRELATED = 4.0
 WRONG_WAY = 5.0  # standard uncertainties by which a conductivity may change against its sign
 
 
@@ -36,7 +30,7 @@ class Changes:
     # (M,) inverse standard deviations, of noise and of model error; 0 where invalid
     weight: FloatArray
     # (M,) factor by which the variance of an estimate exceeds what independent errors of that size
-    # would give it: model errors go together
+    # would give it: model errors go together, see `inflated`
     variance_inflation: FloatArray
     quiet: bool  # whether nothing presses
     # root mean square of the changes over their noise and what no noise accounts for; what is quiet
@@ -79,7 +73,7 @@ class Changes:
         return replace(
             self,
             weight=there / np.sqrt(variance),
-            variance_inflation=1 + (CORRELATED - 1) * error / variance,
+            variance_inflation=inflated(error / variance, there, self.modes),
             tolerance=error_ratio * self.tolerance,
         )
 
@@ -111,6 +105,21 @@ class Changes:
         """Misfit of a model in which nothing is pressed."""
         count = max(int(np.count_nonzero(self.weight)), 1)
         return float(np.sqrt((self.weighted(self.change) ** 2).sum() / count))
+
+
+def inflated(error_share: FloatArray, valid: BoolArray, modes: FloatArray) -> FloatArray:
+    """Factor (M,) by which model errors that go together weigh more than independent ones.
+
+    A model errs by what a conductivity can do: along the directions that it moves voltages in, and
+    so with about as many voltages at a time as there are to each of them.
+
+    Args:
+        error_share: (M,) share of each variance that is of model errors.
+        valid: (M,) which voltages count.
+        modes: (M, K) the directions.
+    """
+    together = max(np.count_nonzero(valid) / max(modes.shape[1], 1), 1.0)
+    return 1 + (together - 1) * error_share
 
 
 def towards_pressing(

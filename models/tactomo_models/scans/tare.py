@@ -21,7 +21,7 @@ from tactomo_models.physics.actual_sheet import SheetEstimator, Sheets, explains
 from tactomo_models.physics.artifact import MODEL_ERROR, Artifact, nominal_noise_v
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.robust import median, robust_sigma
-from tactomo_models.scans.changes import CORRELATED, WRONG_WAY, Changes, missing
+from tactomo_models.scans.changes import WRONG_WAY, Changes, inflated, missing
 from tactomo_models.scans.companion_forces import CompanionForce, CompanionReading
 from tactomo_models.scans.frame_noise import FrameNoiseEstimator, hides_press, is_noise, noise_limit
 from tactomo_models.scans.measurement import Measurement
@@ -250,7 +250,7 @@ class ChannelTare:
         changes = Changes(
             change=change,
             weight=valid / np.sqrt(noise + error),
-            variance_inflation=1 + (CORRELATED - 1) * error / (noise + error),
+            variance_inflation=inflated(error / (noise + error), valid, self._modes),
             noise_variance=noise,
             tolerance=still_share * error,
             modes=self._modes,
