@@ -70,8 +70,8 @@ def test_every_row_of_one_sheet(small: SensorDescription, channel: Channel) -> N
             for frames in frames_of_row(sensor, row, "tikhonov", "tuning", 1).values():
                 for score in (each.score for each in islice(frames, 12, 13)):
                     # A palm may press too lightly for a graded sheet: its true map is all 0.
-                    is_felt = any(contact.magnitude > 0 for contact in score.contacts)
-                    assert np.isfinite(score.rie) == is_felt
+                    rests = all(contact.magnitude == 0 for contact in score.contacts)
+                    assert np.isfinite(score.rie) or rests
 
 
 @pytest.mark.parametrize("name", OUTLINES)
