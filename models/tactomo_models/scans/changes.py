@@ -119,7 +119,7 @@ def inflated(error_share: FloatArray, valid: BoolArray, modes: FloatArray) -> Fl
         modes: (M, K) the directions.
     """
     together = max(np.count_nonzero(valid) / max(modes.shape[1], 1), 1.0)
-    return 1 + (together - 1) * error_share
+    return np.asarray(1 + (together - 1) * error_share)
 
 
 def towards_pressing(
