@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import socket
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from typing import Any
 
@@ -13,6 +14,7 @@ from fake_control import FakeControl
 from tactomo_client import (
     Contact,
     Frame,
+    NoAnswer,
     StreamTimeout,
     aio,
 )
@@ -169,5 +171,18 @@ def test_a_command_that_is_given_up_does_not_spoil_the_next(run: Run) -> None:
                 with pytest.raises(asyncio.CancelledError):
                     await giving_up
                 assert await daemon.request("tare", PATIENCE_S) == {"scans": 20}
+
+    run(main())
+
+
+def test_a_client_that_is_closed_gets_no_answer(run: Run) -> None:
+    async def main() -> None:
+        with socket.create_server(("127.0.0.1", 0)) as silent:
+            daemon = aio.Control(f"tcp://127.0.0.1:{silent.getsockname()[1]}")
+            waiting = asyncio.create_task(daemon.request("tare", PATIENCE_S))
+            await asyncio.sleep(0.1)
+            daemon.close()
+            with pytest.raises(NoAnswer):
+                await waiting
 
     run(main())

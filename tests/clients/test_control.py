@@ -76,3 +76,8 @@ def test_a_daemon_that_goes_away_during_a_command_is_missed() -> None:
         threading.Timer(0.5, server.shutdown, [socket.SHUT_RDWR]).start()
         with pytest.raises(NoAnswer, match="nothing listens there"):
             Daemon(address, connect_timeout_s=0.3).tare(PATIENCE_S)
+
+
+def test_a_request_that_the_daemon_would_hang_up_on_is_refused_at_once() -> None:
+    with pytest.raises(MessageError, match="is over 65536"):
+        request("record_start", "ipc:///nowhere/at/all", path="x" * 70_000)

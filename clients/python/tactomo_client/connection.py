@@ -131,8 +131,11 @@ class Connection:
             raise refusal
 
     def refusal(self) -> KeysError | None:
-        """Return why the server lets nobody in by these keys; None as long as it may do so."""
-        return self.handshakes.refusal(self.address, self._keys)
+        """Return why the server lets nobody in by these keys; None as long as it may do so.
+
+        None, too, of a connection that somebody has closed meanwhile.
+        """
+        return self.handshakes.refusal(self.address, self._keys) if self.is_open else None
 
     def knock_again(self) -> KeysError | None:
         """Return why the server does not let us in, if so, and try again from time to time.

@@ -41,6 +41,7 @@ EVENT: Final = "event"
 KINDS: Final = (MAP, CONTACTS, SCAN, STATUS, EVENT)
 
 MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
+MAX_REQUEST_BYTES: Final = 64 * 1024
 MAX_ENTRIES: Final = 4096  #: of one list or map
 MAX_DEPTH: Final = 16  #: of lists and maps in each other
 
@@ -120,8 +121,14 @@ def clock_id() -> str:
 
 
 def encode_request(command: str, arguments: Mapping[str, Any]) -> bytes:
-    """Return the bytes of one control request."""
-    return _pack({"schema": SCHEMA, "command": command, "arguments": dict(arguments)})
+    """Return the bytes of one control request; raise MessageError if they are too many.
+
+    The daemon hangs up on whoever sends more, without an answer.
+    """
+    data = _pack({"schema": SCHEMA, "command": command, "arguments": dict(arguments)})
+    if len(data) > MAX_REQUEST_BYTES:
+        raise MessageError(f"a request of {len(data)} bytes is over {MAX_REQUEST_BYTES}")
+    return data
 
 
 def decode_request(data: bytes) -> tuple[str, dict[str, Any]]:

@@ -18,7 +18,12 @@ from typing import Annotated, Any, Final, NamedTuple
 import zmq
 from pydantic import AfterValidator, ConfigDict, Field
 from tactomo_client import MessageError
-from tactomo_client.messages import decode_request, encode_error, encode_reply
+from tactomo_client.messages import (
+    MAX_REQUEST_BYTES,
+    decode_request,
+    encode_error,
+    encode_reply,
+)
 
 from tactomo.config import BudgetMs
 from tactomo.endpoint import rebind
@@ -29,7 +34,6 @@ from tactomo.stream.commands import Arguments, Nothing, obey
 from tactomo.stream.peers import Peers
 from tactomo.worker import Bell, Worker
 
-MAX_REQUEST_BYTES: Final = 64 * 1024
 POLL_MS: Final = 250  # between looks at what is idle
 POLL_WHILE_PENDING_MS: Final = 10
 MAX_PENDING: Final = 1024
