@@ -754,7 +754,7 @@ static Sizes sizes_of(const Field *f, const double *each) {
                  .stronger = 1 / left,
                  .by_size = by_size,
                  .by_edge = -by_size / moment,
-                    .reach2 = reach * reach};
+                 .reach2 = reach * reach};
 }
 
 static Outline outline_at(const Field *f, const Contact *c, double x, double y, int with_slopes) {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Self, TypeVar
@@ -12,7 +13,7 @@ PATIENCE_S = 60.0
 _T = TypeVar("_T")
 
 
-class InThread:
+class InThread(ABC):
     """Runs `_run` in a thread of its own until closed; usable in a `with` block.
 
     A class that derives from it calls `__init__` last: that starts the thread.
@@ -34,8 +35,9 @@ class InThread:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @abstractmethod
     def _run(self) -> None:
-        raise NotImplementedError
+        """What the thread does until it is to close."""
 
 
 @contextmanager
