@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rich import console
 from rich.segment import Segment
 
 from tactomo.plain import plain
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, ProgressColumn
 
 PAGE_WIDTH: Final = 150  # columns that the widest table takes
 
@@ -35,3 +38,12 @@ def page() -> Console:
     """The terminal; where there is none, a page as wide as tables are: a file has no width."""
     shown = Console()
     return shown if shown.is_terminal else Console(width=PAGE_WIDTH)
+
+
+def progress(*columns: str | ProgressColumn, **settings: Any) -> Progress:
+    """Return bars for standard error, which are gone in the end; a file or a pipe gets nothing."""
+    from rich.progress import Progress
+
+    shown = Console(stderr=True)
+    hidden = not shown.is_interactive
+    return Progress(*columns, console=shown, transient=True, disable=hidden, **settings)

@@ -49,11 +49,9 @@ def _finite(value: Any) -> Any:
 @contextmanager
 def progress_bar(doing: str) -> Iterator[Callable[[float, float], None]]:
     """Show a bar on standard error while this lasts, if that is a terminal."""
-    from rich.progress import Progress
+    from tactomo.cli.console import progress
 
-    from tactomo.cli.console import Console
+    with progress() as bar:
+        task = bar.add_task(doing, total=None)
 
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(doing, total=None)
-
-        yield lambda done, total: progress.update(task, completed=done, total=total)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -153,7 +153,8 @@ def this_program() -> str:
             raise ServiceError(
                 f"{path} is in a folder that the service does not see",
                 "install tactomo where it does: `python3 -m venv /opt/tactomo` with the system's "
-                "Python, then `/opt/tactomo/bin/pip install tactomo`; or install the package",
+                "Python, then `/opt/tactomo/bin/pip install ./clients/python .` in a checkout; "
+                "or install the Debian package",
             )
     return str(program)
 

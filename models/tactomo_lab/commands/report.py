@@ -134,12 +134,10 @@ def _cell(summary: Summary, column: Column) -> str:
 
 def shown(items: Iterable[Item], total: int | None, what: str) -> Iterator[Item]:
     """Pass items on, with a progress bar in the terminal; without an end if there is no total."""
-    from rich.progress import track
-    from tactomo.cli.console import Console
+    from tactomo.cli.console import progress
 
-    yield from track(
-        items, description=what, total=total, console=Console(stderr=True), transient=True
-    )
+    with progress() as bar:
+        yield from bar.track(items, total, description=what)
 
 
 def chosen_names(text: str | None, known: Iterable[str], option: str) -> list[str]:

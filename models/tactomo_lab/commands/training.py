@@ -13,7 +13,6 @@ from tactomo.cli.output import print_json, say
 from tactomo.errors import needs
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
     from tactomo_models import SensorDescription
 
     from tactomo_lab.training.configurations import Prepared
@@ -57,13 +56,14 @@ def simulate(
     the range; both signs; contrast 10 to 100; sheets up to as uneven as hand-made sheets; uneven,
     displaced and sometimes weak electrodes. Training adds the noise.
     """
+    from tactomo.cli.console import progress
     from tactomo_models import load_description
 
     from tactomo_lab.training.training_scenes import simulate as simulate_scenes
 
     description = load_description(sensor)
     steps = simulate_scenes(description, folder, scenes, seed=seed, jobs=jobs)
-    with _progress() as bar:
+    with progress(speed_estimate_period=600) as bar:
         task = bar.add_task("scenes", total=scenes)
         for more in steps:
             bar.advance(task, more)
@@ -173,7 +173,7 @@ def _train(
     prepared: Prepared, settings: Settings, checkpoint: Path, configuration: str
 ) -> Training:
     """Train to the end, and print what each epoch came to."""
-    from tactomo.cli.console import Console
+    from tactomo.cli.console import Console, progress
 
     from tactomo_lab.training.train import begin, load_checkpoint, train
 
@@ -182,7 +182,7 @@ def _train(
     if checkpoint.exists():
         load_checkpoint(training, settings, checkpoint)
         console.print(f"going on after epoch {len(training.history)}, from {checkpoint}")
-    with _progress() as shown:
+    with progress(speed_estimate_period=600) as shown:
         task = shown.add_task("")
 
         def report(step: int, steps: int, loss: float) -> None:
@@ -214,10 +214,3 @@ def _in_words(epoch: Epoch, number: int) -> str:
         for noise, row in rows.items()
     ]
     return f"epoch {number}: loss {epoch.loss:.4f}; held-out ICC ({names}): {', '.join(parts)}"
-
-
-def _progress() -> Progress:
-    from rich.progress import Progress
-    from tactomo.cli.console import Console
-
-    return Progress(console=Console(stderr=True), transient=True, speed_estimate_period=600)

@@ -304,7 +304,7 @@ def test_record_a_file_for_some_seconds(
     control.answers["record_stop"] = {"path": "/x.mcap", "bytes": 1_230_000}
     control.answers["status"] = STATUS
     result = tactomo("record", "x.mcap", "--seconds", "0.6", status=0)
-    assert result.stdout.endswith("recorded /x.mcap (1.23 MB)\n")
+    assert result.stdout == "recorded /x.mcap (1.23 MB)\n"
     asked = [command for command, _ in control.requests]
     assert asked == ["record_start", *["status"] * 3, "record_stop"]
 
@@ -323,7 +323,7 @@ def test_a_recording_ends_with_the_command_and_its_terminal(
         process.send_signal(number)
         said, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0
-    assert said.endswith("recorded /x.mcap (1.23 MB)\n")
+    assert said == "recorded /x.mcap (1.23 MB)\n"
     assert control.requests[-1][0] == "record_stop"
 
 
@@ -355,7 +355,7 @@ def test_poke_sends_numbers_as_numbers(tactomo: Run, control: Any) -> None:
 def test_poke_tells_that_there_is_nothing_to_release(tactomo: Run, control: Any) -> None:
     command = ("poke", "release", "id=thumb", "--address", control.address)
     control.answers["release"] = {"released": True}
-    tactomo(*command, status=0)
+    assert tactomo(*command, status=0).stdout == ""
     control.answers["release"] = {"released": False}
     result = tactomo(*command)
     assert (result.returncode, result.stdout) == (1, "")

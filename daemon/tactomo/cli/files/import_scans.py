@@ -48,11 +48,11 @@ def import_scans(
     program saves one .eit file per frame; the files are read in the order of their dates. Readings
     of companions (`companion_NAME`) are kept.
     """
-    from rich.progress import track
     from tactomo_models import load_description
     from tactomo_models.sensor.description_file import carried_text
     from tactomo_protocol import Channel
 
+    from tactomo.cli.console import progress
     from tactomo.recordings.imported_scans import read_scans
     from tactomo.recordings.recording_writer import write_recording
 
@@ -63,16 +63,17 @@ def import_scans(
     times_s = read.times(rate)
     mean_rate_hz = (len(times_s) - 1) / times_s[-1] if times_s[-1] > 0 else 0.0
     total = read.count * len(read.volts)
-    length = write_recording(
-        recording,
-        read.hello(measured, float(mean_rate_hz)),
-        track(read.packets(times_s, measured), "importing", total, transient=True),
-        sensor=sensor,
-        description=_portable(description),
-        description_sha256=measured.sha256,
-        description_text=carried_text(measured, description),
-        reference=read.reference_of(reference),
-    )
+    with progress() as bar:
+        length = write_recording(
+            recording,
+            read.hello(measured, float(mean_rate_hz)),
+            bar.track(read.packets(times_s, measured), total, description="importing"),
+            sensor=sensor,
+            description=_portable(description),
+            description_sha256=measured.sha256,
+            description_text=carried_text(measured, description),
+            reference=read.reference_of(reference),
+        )
     for note in read.notes:
         say(note)
     say(

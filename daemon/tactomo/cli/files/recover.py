@@ -36,19 +36,19 @@ def recover(
     run. After a gap, the replay starts cold; where the reference is lost, there are no maps.
     """
     need_recording(recording)
-    from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn
+    from rich.progress import BarColumn, DownloadColumn, TimeRemainingColumn
 
-    from tactomo.cli.console import Console
+    from tactomo.cli.console import progress
     from tactomo.recordings.recording import open_recording
     from tactomo.recordings.recovery import recover as rewrite
 
     target = output or recording.parent / f"{recording.stem}-recovered.mcap"
     columns = ("recovering", BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("")
+    with progress(*columns) as bar:
+        task = bar.add_task("")
 
         def show(done: int, total: int) -> None:
-            progress.update(task, completed=done, total=total)
+            bar.update(task, completed=done, total=total)
 
         recovery = rewrite(recording, target, show)
     say(f"{target}: {_kept(open_recording(target).summary)}")

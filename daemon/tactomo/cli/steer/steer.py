@@ -185,7 +185,7 @@ def poke(
     if command == "press":
         _await_reference(twin)
     answer = request(command, twin, **named)
-    if answer.get("released") is False:
+    if answer.pop("released", True) is False:
         raise TactomoError("no press has this id", "`tactomo poke scene` lists the presses")
     if answer:
         print_json(answer)
@@ -220,9 +220,10 @@ def _untared(twin: str) -> str:
 
 
 def _record_for(daemon: Daemon, name: str, seconds: float | None, maps: bool | None) -> None:
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
     from tactomo.cli.children import interrupt_at_end
+    from tactomo.cli.console import progress
 
     interrupt_at_end()  # the daemon would go on, and fill its disk
     size = TextColumn("{task.fields[size]}")
@@ -230,15 +231,15 @@ def _record_for(daemon: Daemon, name: str, seconds: float | None, maps: bool | N
     with (
         daemon.record(name, maps=maps) as recording,
         suppress(KeyboardInterrupt),  # the way to end a recording without --seconds
-        Progress(*columns, transient=True) as progress,
+        progress(*columns) as bar,
     ):
         begin_s = time.monotonic()  # a disk may have taken seconds over the start
-        task = progress.add_task(recording.path, total=seconds, size="")
+        task = bar.add_task(recording.path, total=seconds, size="")
         while seconds is None or time.monotonic() - begin_s < seconds:
             now = daemon.status().recording
             passed_s = time.monotonic() - begin_s
             recorded = f"{now.bytes / 1e6:.1f} MB" if now else ""
-            progress.update(task, completed=passed_s, size=recorded)
+            bar.update(task, completed=passed_s, size=recorded)
             left_s = 0.5 if seconds is None else seconds - passed_s
             time.sleep(max(0.0, min(0.5, left_s)))
     if recording.file is not None:
