@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 from tactomo_client import Contact, Frame
 from tactomo_client.appearance import COLOURS, map_pixels, shown_image
 
@@ -72,7 +73,8 @@ def _subtitle(course: Course) -> str:
     length_s = course.times_s[-1] - course.times_s[0]
     words = (
         f"{course.sensor}, {began}",
-        f"{length_s:.1f} s, {len(course.times_s)} frames, {len(course.tracks)} contacts",
+        f"{length_s:.1f} s, {counted(len(course.times_s), 'frame')}, "
+        f"{counted(len(course.tracks), 'contact')}",
     )
     return "   |   ".join(words)
 
@@ -313,7 +315,7 @@ def _draw_misfit(axes: Any, course: Course, _: dict[str, Any]) -> None:
     if max(known, default=0.0) > 10 * max(1.0, float(np.median(known or [1.0]))):
         axes.set_yscale("log")
     else:
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, max(1.2, axes.get_ylim()[1]))
     axes.set_ylabel("misfit")
 
 
@@ -363,7 +365,10 @@ def _draw_timing(axes: Any, course: Course, _: dict[str, Any]) -> None:
     axes.set_title(words, fontsize=8, loc="right", pad=2, color=INK)
     if known_ms:
         axes.set_yscale("log")
-        axes.yaxis.set_minor_formatter("")  # a decade or less would be labelled in full
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("")
+        axes.set_ylim(top=4.0 * axes.get_ylim()[1])  # for the legend
     else:
         axes.set_ylim(0.0, 2.0 * float(np.median(periods_ms)) if len(periods_ms) else None)
     axes.set_ylabel("ms")
