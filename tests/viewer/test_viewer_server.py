@@ -204,6 +204,23 @@ async def test_a_page_hears_whether_others_press(sensor: FakeSensor) -> None:
             assert not (await page.next("twin"))["others_press"]
 
 
+@on_loop
+async def test_a_page_that_is_loaded_again_finds_its_own_press_gone(sensor: FakeSensor) -> None:
+    with FakeControl({"scene": {"presses": []}, "press": {}, "release": {}}) as twin:
+        async with viewer_of(sensor, twin=twin.address) as viewer:
+            async with viewer.page() as page, viewer.page() as other:
+                await page.ask(type="press", press="idle-0", x_mm=0, y_mm=0)
+                (press,) = [asked["id"] for command, asked in twin.requests if command == "press"]
+                twin.answers["scene"] = {"presses": [{"id": press}]}
+                while not (await other.next("twin"))["others_press"]:
+                    pass
+            while "release" not in [command for command, _ in twin.requests]:
+                await asyncio.sleep(0.01)
+            await asyncio.sleep(0.1)
+            async with viewer.page() as page:
+                assert not (await page.next("twin"))["others_press"]
+
+
 @pytest.mark.slow
 @on_loop
 async def test_silence_is_told_from_a_hang(sensor: FakeSensor) -> None:

@@ -57,7 +57,7 @@ class Browser:
         self._unconfirmed = 0
         self._sent: dict[str, object] = {}  # by kind, what was sent last
         self._last_event = 0
-        self._presses: set[str] = set()  # to be released when the page goes away
+        self.presses: set[str] = set()  # their ids; to be released when the page goes away
         self._answers: set[asyncio.Task[None]] = set()
         self.twin_presses: Sequence[str] | None = None  # their ids; None where no twin answers
 
@@ -164,16 +164,16 @@ class Browser:
             return await self._command(asked.get("command"), asked.get("arguments", {}))
         if kind == "press":
             if asked.get("hold"):  # it stays, even when the page goes away
-                self._presses.discard(press)
+                self.presses.discard(press)
             else:
-                self._presses.add(press)
+                self.presses.add(press)
             arguments = {name: asked[name] for name in PRESS_ARGUMENTS if name in asked}
             return await self._ask_twin("press", {"id": press, **arguments})
         if kind == "release":
-            self._presses.discard(press)
+            self.presses.discard(press)
             return await self._ask_twin("release", {"id": press})
         if kind == "clear":
-            self._presses.clear()
+            self.presses.clear()
             return await self._ask_twin("clear", {})
         raise ControlError("the page sent an unknown request", name="unknown_command")
 
@@ -205,7 +205,7 @@ class Browser:
     async def _leave(self) -> None:
         # Commands under way are finished first: a release must not overtake its press.
         await asyncio.gather(*self._answers, return_exceptions=True)
-        for press in self._presses:
+        for press in self.presses:
             with contextlib.suppress(ClientError):
                 await self._ask_twin("release", {"id": press})
 

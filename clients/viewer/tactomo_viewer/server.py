@@ -160,6 +160,8 @@ class Viewer:
         finally:
             self._browsers.discard(browser)
             self._sockets.discard(socket)
+            if self._twin_presses is not None:  # the page that is loaded next hears of no others
+                self._twin_presses = [p for p in self._twin_presses if p not in browser.presses]
         return socket
 
     async def _say_goodbye(self, _: web.Application) -> None:
