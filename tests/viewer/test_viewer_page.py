@@ -1083,16 +1083,20 @@ def test_what_stops_is_told_and_comes_back(page: Page) -> None:
     wait_until(lambda: page["count"].text == "1")
     point_at(page, 36, -48)
     wait_until(lambda: page["readout"].text.endswith(": 200 kPa"))
+    page.mouse("Pressed", 36, -48)
+    wait_until(lambda: page["error"].text == "error 0.0 mm, 20 kPa")
     page.skin.sends_frames = False
     wait_until(lambda: page.health == "stale")
     wait_until(lambda: page["readout"].text.endswith(" mm"))  # of before: nobody knows it now
+    wait_until(lambda: page["error"].text == "")
+    page.mouse("Released", 36, -48)
     assert page.banner.startswith("Stale. The newest frame is ")
     assert page["state"].text == "stale"
     wait_until(lambda: page.map_classes == {"pressable", "stale"})
     wait_until(lambda: page["no-contacts"].text == "Not known.")  # and not "Nothing pressed."
     closed = {"severity": "error", "what": "/dev/ttySKIN is closed", "next_step": "plug it in"}
     page.skin.status |= {"issues": [closed]}
-    wait_until(lambda: page.banner.endswith("/dev/ttySKIN is closed"))
+    wait_until(lambda: page.banner.endswith(" s old; /dev/ttySKIN is closed"))
     page.skin.status |= {"issues": []}
     page.skin.sends_frames = True
     wait_until(lambda: page.health == "good")
@@ -1171,6 +1175,8 @@ def test_at_every_width_all_is_seen_and_nothing_moves_when_a_banner_comes(page: 
         )
         assert right < page.js("return document.getElementById('map').clientWidth")
         assert right - left >= least
+        (one, upper, wide), (other, lower, _) = sorted(page.js("return tactomo.labels()"))
+        assert abs(upper - lower) >= 22 or other >= one + wide  # both can be read
         before = page.js(places)
         page.skin.status |= {"issues": [told]}
         wait_until(lambda: page["banner"].is_displayed())

@@ -60,7 +60,7 @@ export function verdict(state, now) {
   const errors = (fields.issues ?? []).filter(({ severity }) => severity === "error");
   const wrong = errors.map(({ what }) => what).join("; ");
   if (fields.state.startsWith("waiting")) {
-    return banner("no-data", fields.uptime_s < SOON_S ? "info" : "warning", "No data yet.", wrong);
+    return banner("no-data", fields.uptime_s < SOON_S ? "info" : "warning", "No data yet:", wrong);
   }
   if (fields.ports?.length && fields.ports.every((port) => port.state === "ended")) {
     return banner("ended", "info", "The replay is at its end.", "The map shows its last frame.");
@@ -74,8 +74,8 @@ export function verdict(state, now) {
   }
   const age = Math.min(ageOf(frame, now), now - state.stoodAt);
   if (age > staleAfter(fields, hello)) {
-    const since = frame ? `The newest frame is ${seconds(age)} old. ` : "";
-    return banner("stale", "error", "Stale.", since + wrong);
+    const since = frame ? `The newest frame is ${seconds(age)} old` : "";
+    return banner("stale", "error", "Stale.", [since, wrong].filter(Boolean).join("; "));
   }
   const [issue] = errors;
   return issue ? banner("issue", "warning", `${issue.what}:`, issue.next_step) : null;

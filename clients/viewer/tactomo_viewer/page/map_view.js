@@ -9,6 +9,7 @@ const OUTLINE_FINER = 3;
 const ELECTRODE_MM = [6, 2.4];  // drawn size: along the rim, across it
 const NARROW_PX = 520;     // below this the colour bar lies under the map
 const MARK_PX = 8;         // from a contact's rim to its mark
+const LABEL_HEIGHT = 22;   // px
 const TICK_PX = 28;        // the least room of a number under the map
 
 /** The corners of a sheet's bounding box. */
@@ -137,6 +138,7 @@ export class MapView {
     if (scene.outline && scene.frame?.images.structure) this.#outline(c, scene.frame);
     for (const press of scene.presses) this.#press(c, press);
     if (scene.cursor) this.#cursor(c, scene.cursor);
+    this.labels = [];
     for (const contact of scene.frame?.contacts ?? []) {
       if (contact.id === scene.marked) this.#mark(c, contact);
       this.#contact(c, contact, scene.label(contact));
@@ -231,16 +233,23 @@ export class MapView {
     const number = String(contact.id);
     const numberWidth = Math.max(20, c.measureText(number).width + 10);
     const width = numberWidth + c.measureText(label).width + 14;
-    const { left, top, width: w } = this.plot;
+    const { left, top, width: w, height: h } = this.plot;
     const end = this.plot.narrow ? this.size[0] : left + w;
-    const bx = Math.min(x + 10, end - width - 2);
-    const by = y - 34 < top ? y + 12 : y - 34;
+    const [right, above, below] = [Math.min(x + 10, end - width - 2), y - 34, y + 12];
+    const beside = Math.max(2, x - 10 - width);
+    const spots = [above, below, above - LABEL_HEIGHT, below + LABEL_HEIGHT]
+      .flatMap((spot) => [[right, spot], [beside, spot]])
+      .filter(([, spot]) => spot >= top && spot + LABEL_HEIGHT <= top + h);
+    const isFree = ([sx, sy]) => this.labels.every(([lx, ly, lw]) =>
+      sx > lx + lw || lx > sx + width || Math.abs(sy - ly) >= LABEL_HEIGHT);
+    const [bx, by] = spots.find(isFree) ?? spots[0] ?? [right, below];
+    this.labels.push([bx, by, width]);
     c.beginPath();
-    c.roundRect(bx, by, width, 22, 11);
+    c.roundRect(bx, by, width, LABEL_HEIGHT, 11);
     c.fillStyle = "rgba(10, 12, 20, 0.82)";
     c.fill();
     c.beginPath();
-    c.roundRect(bx, by, numberWidth, 22, 11);
+    c.roundRect(bx, by, numberWidth, LABEL_HEIGHT, 11);
     c.fillStyle = contactColour(contact.id);
     c.fill();
     c.textBaseline = "middle";

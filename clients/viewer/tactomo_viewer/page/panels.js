@@ -1,7 +1,7 @@
 // The panels beside the map: what the newest frame, status and events say, as text.
 
 import { contactColour } from "./colormap.js";
-import { UNITS, fixed, forceOf, pressureOf, quantityText } from "./values.js";
+import { UNITS, fixed, forceOf, pressureOf, quantityText, seconds } from "./values.js";
 
 const EVENTS_SHOWN = 50;
 const TROUBLE_SHOWN_S = 3600;
@@ -162,7 +162,7 @@ function showChannels({ state, ports, rates, events, companions = {}, companion_
   for (const { name, severity, age_s: age } of events?.troubles ?? []) {
     if (age > TROUBLE_SHOWN_S) continue;
     const kind = severity === "error" ? "bad" : "warn";
-    lines.push([kind, name.replaceAll("_", " "), `${events.counts[name]} ×, last ${fixed(age / 60, 0)} min ago`]);
+    lines.push([kind, name.replaceAll("_", " "), `${events.counts[name]} ×, last ${age < 60 ? seconds(1000 * age) : `${fixed(age / 60, 0)} min`} ago`]);
   }
   if (!isCurrent) lines.splice(0, Infinity, ...lines.map(([, name]) => ["", name, "not known"]));
   const list = byId("channels");

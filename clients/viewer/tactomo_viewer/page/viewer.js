@@ -62,6 +62,7 @@ window.tactomo = {
   touch,
   timeline,
   idle,
+  labels: () => view.labels,
   mmToPixel: (x, y) => view.mmToPixel(x, y),
   pixelToMm: (x, y) => view.pixelToMm(x, y),
   state,
@@ -240,7 +241,7 @@ function contactNear({ x, y, size }) {
 
 // How far contacts are from the presses of this page as these were when the frame was measured.
 function showError(frame) {
-  const at = frame ? frame.receivedAt - frame.age_ms : 0;
+  const at = frame && state.isCurrent ? frame.receivedAt - frame.age_ms : 0;
   const errors = touch.presses.map((press) => Touch.wasAt(press, at)).filter(Boolean).map((press) => {
     const [off, contact] = (frame?.contacts ?? [])
       .map((each) => [Math.hypot(each.x_mm - press.x, each.y_mm - press.y), each])
@@ -289,6 +290,7 @@ function refresh() {
   setText(byId("map-help"), found ? "" : helpText(canPress));
   showNumbers(now);
   showReadout();
+  if (!state.isCurrent) showError(null);
   speak(found, now);
   const isPaused = timeline.isPaused;
   setText(byId("pause"), isPaused ? "Back to now" : "Pause");
@@ -361,6 +363,7 @@ function speak(found, now) {
   const words = all.filter(Boolean).join(", ");
   if (words !== unspoken.words) unspoken = { words, since: now };
   else if (now - unspoken.since > SPOKEN_MS) {
+    unspoken.since = Infinity;
     byId("spoken").ariaLive = found?.level === "error" ? "assertive" : "polite";
     setWords(byId("spoken"), words);
   }
