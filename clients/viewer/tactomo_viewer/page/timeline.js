@@ -115,8 +115,8 @@ export class Timeline {
         return `${contact.id}: ${pressureText(contact, unit)}${force ? `, ${force} N` : ""}`;
       });
     const near = this.events.filter((event) => Math.abs(this.#x(event.at) - this.#x(at)) < EVENT_REACH_PX);
-    const ago = `−${seconds(Math.max(0, (this.pausedAt ?? this.end) - at))}`;
-    return [ago, ...contacts, ...near.map(({ name }) => name)].join(" · ");
+    const ago = seconds(Math.max(0, (this.pausedAt ?? this.end) - at));
+    return [ago === seconds(0) ? ago : `−${ago}`, ...contacts, ...near.map(({ name }) => name)].join(" · ");
   }
 
   /**

@@ -360,7 +360,7 @@ function speak(found, now) {
     ...[...byId("quality").children].map(({ textContent: flag }) => (flag === "good" ? "" : flag)),
     touch.cursor && byId("readout").textContent,
   ];
-  const words = all.filter(Boolean).join(", ");
+  const words = all.filter(Boolean).join(", ").replace(/[.;:]\s*, /g, ". ");
   if (words !== unspoken.words) unspoken = { words, since: now };
   else if (now - unspoken.since > SPOKEN_MS) {
     unspoken.since = Infinity;
