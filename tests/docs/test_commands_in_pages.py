@@ -16,12 +16,17 @@ PAGES = [
     *(ROOT / "README.md", ROOT / "deploy" / "README.md"),
     *sorted((ROOT / "docs").glob("*.md")),
 ]
+SETTINGS = sorted(
+    path for path in (ROOT / "deploy").rglob("*.*") if path.suffix not in (".md", ".py", ".sh")
+)
 
 
 def told(page: Path) -> list[str]:
     """What follows `tactomo` in blocks of shell commands, and between backquotes."""
     read = Page(page.relative_to(ROOT).as_posix())
     lines = [line.split("#")[0] for line in read.commands()]
+    if page in SETTINGS:
+        lines = re.findall(r"^# +(tactomo .*)", read.text, re.M)
     spans = [" ".join(span.split()) for span in re.findall(r"`(tactomo [^`]+)`", read.text)]
     found = [re.search(r"\btactomo ([a-z][^|>]*)", line) for line in [*lines, *spans]]
     return [each[1].strip() for each in found if each]
@@ -33,6 +38,7 @@ def options_of(words: list[str]) -> tuple[str, set[str]]:
     name = "tactomo"
     for word in words:
         if word not in getattr(command, "commands", ()):
+            assert not hasattr(command, "commands") or not word.isalpha(), f"{name} {word}"
             break
         command, name = command.commands[word], f"{name} {word}"
     return name, {
@@ -40,7 +46,7 @@ def options_of(words: list[str]) -> tuple[str, set[str]]:
     }
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+@pytest.mark.parametrize("page", [*PAGES, *SETTINGS], ids=lambda p: p.name)
 def test_each_option_is_one_that_the_command_has(page: Path) -> None:
     for line in told(page):
         name, options = options_of(line.split())
