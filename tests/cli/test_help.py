@@ -208,6 +208,37 @@ def test_no_option_takes_a_number_without_end(words: list[str], number: str) -> 
 
 
 @pytest.mark.parametrize(
+    "words",
+    [
+        ["bench", "--seconds", "1e308"],
+        ["bench", "--count", "1000000000000"],
+        ["doctor", "--seconds", "1e308"],
+        ["watch", "--seconds", "1e308"],
+        ["record", "a.mcap", "--seconds", "1e308"],
+        ["twin", "--noise-uv", "1e308"],
+        ["demo", "--noise-uv", "1e308"],
+        ["ports", "--ask", "--baud", "1000000000000"],
+        ["replay", GOLDEN, "--start", "1e308"],
+        ["replay", GOLDEN, "--start", "1e6"],
+        ["replay", GOLDEN, "--speed", "1e308"],
+        ["replay", GOLDEN, "--speed", "1e-300"],
+        ["export", GOLDEN, "frames", "--lerobot", "--fps", "1000000000000"],
+        ["evaluate", "field", "--count", "1000000000000"],
+        ["evaluate", "paper", "--count", "1000000000000"],
+        ["evaluate", "paper", "--sheets", "1000000000000"],
+        ["models", "simulate", "scenes", "--scenes", "1000000000000"],
+        ["models", "simulate", "scenes", "--jobs", "1000000000000"],
+        ["models", "train", "scenes", "--epochs", "1000000000000"],
+    ],
+    ids=" ".join,
+)
+def test_no_option_takes_an_absurd_number(words: list[str]) -> None:
+    """Taken, each ends in a traceback or never."""
+    result = CliRunner().invoke(app, words, prog_name="tactomo")
+    assert result.exit_code == 2, result.output
+
+
+@pytest.mark.parametrize(
     "words", [["recover", GOLDEN], ["calibrate", "live"], ["teach", "live"]], ids=" ".join
 )
 @pytest.mark.parametrize("folder", ["", ".", "/"])

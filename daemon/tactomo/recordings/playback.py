@@ -130,8 +130,8 @@ class Playback:
         Returns the fields as they are before anything goes on.
         """
         with self._changed:
-            position_ns = self.start_ns + round(position_s * 1e9)
-            self.begin_ns = self._position_ns = min(position_ns, self._last_ns)
+            ahead_ns = min(position_s * 1e9, self._last_ns - self.start_ns)
+            self.begin_ns = self._position_ns = self.start_ns + round(ahead_ns)
             self._since_ns = None
             self._is_stepping = self._is_paused
             self.passes += 1

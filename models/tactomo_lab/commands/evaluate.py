@@ -44,7 +44,7 @@ def _group() -> None:
 )
 def field(
     seeds: Seeds = "tuning",
-    count: Annotated[int, typer.Option(min=1, help="Scenes of each line.")] = 10,
+    count: Annotated[int, typer.Option(min=1, max=10_000, help="Scenes of each line.")] = 10,
     rows: Annotated[
         str | None, typer.Option(help="Which rows, with commas; or regimes. [all below]")
     ] = None,

@@ -45,9 +45,11 @@ app = options.typer_app()
 def paper(
     figure: Annotated[str, typer.Option(help="The paper's figures, with commas.")] = "5,9,10",
     count: Annotated[
-        int, typer.Option(min=1, help="Fig. 5: scenes of each number of contacts.")
+        int, typer.Option(min=1, max=10_000, help="Fig. 5: scenes of each number of contacts.")
     ] = 100,
-    sheets: Annotated[int, typer.Option(min=1, help="Figs. 9 and 10: sensors to press.")] = 3,
+    sheets: Annotated[
+        int, typer.Option(min=1, max=1000, help="Figs. 9 and 10: sensors to press.")
+    ] = 3,
     method: Annotated[
         list[str] | None,
         options.methods_option(" [tikhonov, cnn-single, cnn-multimodal; network, auto]"),

@@ -38,10 +38,11 @@ app = typer_app()
 )
 def simulate(
     folder: Annotated[Path, typer.Argument(help="Folder for the scenes; made if missing.")],
-    scenes: Annotated[int, typer.Option(min=1, help="How many.")] = 24000,
+    scenes: Annotated[int, typer.Option(min=1, max=10_000_000, help="How many.")] = 24000,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the whole set.")] = 0,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Processes. [one for each core]", show_default=False)
+        int | None,
+        typer.Option(min=1, max=1024, help="Processes. [one for each core]", show_default=False),
     ] = None,
     sensor: Description = DEFAULT_DESCRIPTION,
     as_json: JsonOutput = False,
@@ -86,10 +87,12 @@ def train(
         ConfigurationName, typer.Option(help="The network (names above).")
     ] = "ours",
     epochs: Annotated[
-        int | None, typer.Option(min=1, help="Passes over the scenes. [the configuration's]")
+        int | None,
+        typer.Option(min=1, max=100_000, help="Passes over the scenes. [the configuration's]"),
     ] = None,
     batch: Annotated[
-        int | None, typer.Option(min=1, help="Scenes in a step. [the configuration's]")
+        int | None,
+        typer.Option(min=1, max=1_000_000, help="Scenes in a step. [the configuration's]"),
     ] = None,
     rate: Annotated[
         float | None, typer.Option(min=1e-6, max=1.0, help="Learning rate. [the configuration's]")
@@ -97,7 +100,7 @@ def train(
     seed: Annotated[int, typer.Option(min=0, help="Seed of weights, order, noise and turns.")] = 0,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="Device that computes.")] = "cpu",
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Processes and threads. [one for each core]")
+        int | None, typer.Option(min=1, max=1024, help="Processes and threads. [one for each core]")
     ] = None,
     output: Annotated[
         Path | None,

@@ -80,7 +80,10 @@ def bench(
     seconds: Annotated[
         float,
         typer.Option(
-            min=1.0, rich_help_panel=LIVE, help="Seconds of each of the four live scenes."
+            min=1.0,
+            max=3600.0,
+            rich_help_panel=LIVE,
+            help="Seconds of each of the four live scenes.",
         ),
     ] = STATUS_S,
     ports: Annotated[
@@ -100,7 +103,9 @@ def bench(
     ] = None,
     count: Annotated[
         int,
-        typer.Option(min=1, rich_help_panel=CHART, help="Still scenes each of 1 to 4 contacts."),
+        typer.Option(
+            min=1, max=1000, rich_help_panel=CHART, help="Still scenes each of 1 to 4 contacts."
+        ),
     ] = 10,
     method: Annotated[
         list[str] | None, options.methods_option(" [every installed one]", rich_help_panel=CHART)

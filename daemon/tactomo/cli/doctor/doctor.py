@@ -51,7 +51,7 @@ def doctor(
     sensor: options.Sensor = None,
     address: options.Address = None,
     seconds: Annotated[
-        float, typer.Option(min=1.0, help="Seconds of listening to the daemon.")
+        float, typer.Option(min=1.0, max=3600.0, help="Seconds of listening to the daemon.")
     ] = 10.0,
     description: Annotated[
         str | None,

@@ -75,7 +75,8 @@ def export(
         ),
     ] = None,
     fps: Annotated[
-        int | None, typer.Option(min=1, help="For --lerobot: steps a second. [the robot's, or 30]")
+        int | None,
+        typer.Option(min=1, max=1000, help="For --lerobot: steps a second. [the robot's, or 30]"),
     ] = None,
     task: Annotated[str, typer.Option(help="For --lerobot: the task, in words.")] = "touch",
     start_s: FromOption = 0.0,

@@ -165,6 +165,8 @@ def replay(
 
     stream, control = free_of((stream, options.DEFAULT_STREAM), (control, options.DEFAULT_CONTROL))
     opened = open_recording(recording)
+    if start > (length_s := opened.summary.duration_s):
+        raise typer.BadParameter(f"--start {start:g}: the recording ends after {length_s:.3f} s")
     origin = opened.origin
     if with_viewer:
         if record is not None:
@@ -250,6 +252,6 @@ def _speed(text: str) -> float:
         factor = 0.0 if text == "max" else float(text)
     except ValueError:
         factor = -1.0
-    if not 0.0 <= factor < float("inf"):
-        raise typer.BadParameter(f"--speed {text}: give a factor above 0, or max")
+    if factor and not 1e-3 <= factor <= 1e3:
+        raise typer.BadParameter(f"--speed {text}: give a factor from 0.001 to 1000, or max")
     return factor

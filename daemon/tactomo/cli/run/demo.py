@@ -47,7 +47,7 @@ def demo(
         Path | None, typer.Option(help="A scripted scene, shipped or TOML, that presses by itself.")
     ] = None,
     noise_uv: Annotated[
-        float | None, typer.Option(min=0.0, help="Converter noise, µV rms.")
+        float | None, typer.Option(min=0.0, max=1e9, help="Converter noise, µV rms.")
     ] = None,
     record: Annotated[
         Path | None, typer.Option(help="Record the ports' bytes to this file.")

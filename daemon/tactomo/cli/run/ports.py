@@ -49,7 +49,10 @@ def ports(
         typer.Option(metavar="my_module:MyProtocol", help="A protocol of your own to recognise."),
     ] = None,
     baud: Annotated[
-        int | None, typer.Option(min=1200, help="Baud rate; USB takes any. [the protocol's usual]")
+        int | None,
+        typer.Option(
+            min=1200, max=12_000_000, help="Baud rate; USB takes any. [the protocol's usual]"
+        ),
     ] = None,
     as_json: JsonOutput = False,
 ) -> None:

@@ -35,7 +35,7 @@ def twin(
     ] = None,
     noise_uv: Annotated[
         float | None,
-        typer.Option(min=0.0, help="Converter noise, µV rms. [60 dB below the signal]"),
+        typer.Option(min=0.0, max=1e9, help="Converter noise, µV rms. [60 dB below the signal]"),
     ] = None,
     unevenness: Annotated[
         float,

@@ -79,7 +79,8 @@ def record(
     ],
     name: Annotated[str | None, typer.Argument(metavar="[FILE]", help="For `start`.")] = None,
     seconds: Annotated[
-        float | None, typer.Option(min=0.1, help="For FILE: how long; until Ctrl-C when left out.")
+        float | None,
+        typer.Option(min=0.1, max=3.2e7, help="For FILE: how long; until Ctrl-C when left out."),
     ] = None,
     maps: Annotated[
         bool, typer.Option("--maps", help="With maps and contacts. [as the daemon is configured]")

@@ -33,7 +33,7 @@ def watch(
     sensor: options.Sensor = None,
     address: options.Address = None,
     seconds: Annotated[
-        float | None, typer.Option(min=0.0, help="Stop after this time. [Ctrl-C]")
+        float | None, typer.Option(min=0.0, max=3.2e7, help="Stop after this time. [Ctrl-C]")
     ] = None,
     keys: options.KeysFolder = None,
 ) -> None:
