@@ -111,11 +111,12 @@ def _is_of_sheet(examined: Examination, layout: Layout, even: BareSheet | None) 
     """Whether the voltages are of the sheet that is described, made by hand or not; if known."""
     if even is None:
         return None
-    if Flag.REFERENCE_MISMATCH not in examined.verdict.flags:
-        return True
-    if examined.verdict.electrodes or not isinstance(layout, SensorDescription):
-        return False
     usable, volts = examined.verdict.usable, examined.mean
+    if usable.any() and Flag.REFERENCE_MISMATCH not in examined.verdict.flags:
+        return True
+    bad = examined.verdict.electrodes or not usable.any()
+    if bad or not isinstance(layout, SensorDescription):
+        return False
     relative = np.divide(examined.noise, np.abs(volts), out=np.ones_like(volts), where=usable)
     noise = np.hypot(relative, MODEL_ERROR)
     sheet = SheetEstimator(layout, even).estimate(volts, usable, noise)

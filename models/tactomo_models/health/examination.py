@@ -95,6 +95,8 @@ class Examination:
         return [(verdict.flags, verdict.electrodes) for verdict in verdicts]
 
     def _states(self, count: int, excess: FloatArray, expected: FloatArray) -> list[str]:
+        if not self.verdict.usable.any():
+            return ["dead"] * count
         states = ["good"] * count
         noisy = (
             set(self.wiring.faulty_electrodes(excess > SIGNIFICANT)) if self.has_noise else set()

@@ -76,7 +76,7 @@ def _exchanged(trial: Trial, straight: list[int], left: float, described: Order)
             for pair in itertools.combinations(range(len(order)), 2)
         ]
         after, moved, pair = min(trials, key=lambda made: made[0])
-        if after > left / 2:
+        if not after < left / 2:  # also where no order has a finite one: voltages that are all zero
             break
         left, expected, order = after, moved, _swapped(order, pair)
         found.append(pair)

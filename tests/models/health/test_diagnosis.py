@@ -64,6 +64,13 @@ def ill(diagnosis: Diagnosis) -> dict[int, str]:
     return {n: state for n, state in enumerate(diagnosis.electrodes) if state != "good"}
 
 
+@pytest.mark.parametrize("has_model", [True, False])
+def test_a_converter_that_reads_zeros_is_broken(patient: Patient, has_model: bool) -> None:
+    found = patient.examine(np.zeros((SCANS, len(patient.rest()))), has_model=has_model)
+    assert found.level == Level.BROKEN
+    assert set(found.electrodes) == {"dead"}
+
+
 @pytest.mark.parametrize("noise", [1e-3, 1e-2])
 @pytest.mark.parametrize("has_model", [True, False])
 def test_a_healthy_skin_is_healthy(patient: Patient, noise: float, has_model: bool) -> None:
