@@ -70,7 +70,7 @@ def read_challenge(path: Path, description: SensorDescription) -> Challenge:
     keys = ("injection", "measurement", "reference", "voltages", "truth")
     arrays = read_set(path, "the challenge's tanks", *keys)
     currents, weights, reference, voltages, truth = (arrays[key] for key in keys)
-    level = arrays.get("level", np.zeros(len(truth))).astype(int)
+    level = arrays.get("level", np.zeros(len(truth)))
     tanks, electrodes = len(truth), description.electrode_count
     readings = currents.shape[-1] * weights.shape[-1]
     shapes = {
@@ -86,11 +86,15 @@ def read_challenge(path: Path, description: SensorDescription) -> Challenge:
             raise DataError(f"{path}: {key} is {array.shape}; {wanted} is needed, drive by drive")
     if not np.isin(truth, (0, 1, 2)).all():
         raise DataError(f"{path}: truth holds other values than 0 water, 1 worse, 2 better")
+    if not np.isin(level, range(8)).all():
+        raise DataError(f"{path}: level holds other values than 0 to 7")
     usable = np.isfinite(reference) & np.isfinite(voltages)
     if not usable.any(axis=1).all():
         tank = int(np.flatnonzero(~usable.any(axis=1))[0])
         raise DataError(f"{path}: tank {tank} has no reading that is a number; leave it out")
-    return Challenge(currents, weights, reference, voltages, truth.astype(np.uint8), level)
+    return Challenge(
+        currents, weights, reference, voltages, truth.astype(np.uint8), level.astype(int)
+    )
 
 
 def evaluate_challenge(

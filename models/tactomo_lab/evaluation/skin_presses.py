@@ -61,6 +61,8 @@ def read_presses(path: Path, description: SensorDescription) -> Presses:
             f"{path}: dv is {volts.shape}, lookup {lookup.shape}, pos_m {position.shape}; (n, M), "
             "(M, 4) and (n, 2) are needed"
         )
+    if not np.isfinite(volts).all() or not np.isfinite(position).all():
+        raise DataError(f"{path}: dv or pos_m has values that are no numbers; leave them out")
     position = position[:, :2]
     order, sign = scan_order(lookup, description)
     changes = np.empty_like(volts)

@@ -81,7 +81,7 @@ def read_tanks(path: Path, description: SensorDescription) -> Tanks:
     """
     arrays = read_set(path, "tanks", "dv", "truth")
     changes, truth = arrays["dv"], arrays["truth"]
-    names = arrays.get("name", np.arange(len(truth)))
+    names = np.atleast_1d(arrays.get("name", np.arange(len(truth))))
     wanted = (len(names), description.measurements)
     if changes.shape != wanted or truth.ndim != 3 or len(truth) != len(names):
         raise DataError(
@@ -90,6 +90,10 @@ def read_tanks(path: Path, description: SensorDescription) -> Tanks:
         )
     if not np.isfinite(changes).all():
         raise DataError(f"{path}: dv holds voltages that are not numbers; leave those tanks out")
+    if not (changes < 0).any():
+        raise DataError(
+            f"{path}: dv never falls, and how far it falls is its scale; give V - V_empty"
+        )
     return Tanks(tuple(str(name) for name in names), changes, truth)
 
 

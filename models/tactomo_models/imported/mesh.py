@@ -49,13 +49,15 @@ def read_model(path: Path, unit_mm: float | None = None) -> Model:
             drives, current_a = _pyeit_drives(held), 1e-4
         else:
             nodes, elements, electrodes, drives, current_a = _eidors(path, held)
+        if not np.isfinite(nodes).all():
+            raise ValueError("its nodes have places that are no numbers")
         if elements.shape[1] != 3 or (nodes[:, 2:] != nodes[:1, 2:]).any():
             raise DataError(
                 f"{path} is a model in three dimensions, and a sheet has two; give a model of the "
                 "sheet's plane, of triangles"
             )
         polygon = shapely.union_all(shapely.polygons(nodes[:, :2][elements]))
-        if polygon.geom_type != "Polygon":
+        if polygon.geom_type != "Polygon" or polygon.is_empty:
             raise DataError(f"{path}: its triangles are not one sheet; describe each as its own")
         extents = [nodes[each, :2] for each in electrodes]
         sizes = np.array([np.hypot(*np.ptp(each, axis=0)) for each in extents])
@@ -67,7 +69,7 @@ def read_model(path: Path, unit_mm: float | None = None) -> Model:
         polygon = shapely.Polygon(polygon.exterior, holes)
         centres = np.array([each.mean(axis=0) for each in extents]).reshape(-1, 2)
         pattern = _pattern(path, drives, len(electrodes), current_a) if drives else None
-    except (IndexError, KeyError, TypeError, ValueError) as error:
+    except (IndexError, KeyError, OverflowError, TypeError, ValueError) as error:
         raise DataError(f"{path}: no model that can be read ({error}); {NEXT}") from error
     return Model(polygon, centres, sizes, unit_mm, pattern)
 

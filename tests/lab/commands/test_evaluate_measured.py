@@ -71,6 +71,24 @@ def test_a_file_that_is_none(tactomo: Run, tmp_path: Path, command: str) -> None
     assert "cannot read" in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("arrays", "told"),
+    [
+        ({"dv": np.ones((1, 208)), "truth": np.ones((1, 8, 8)), "name": ["a"]}, "never falls"),
+        ({"dv": np.ones((1, 208)), "truth": np.ones((1, 8, 8)), "name": "a"}, "never falls"),
+        (
+            {"lookup": np.ones((4, 4)), "dv": np.full((9, 4), np.nan), "pos_m": np.ones((9, 2))},
+            "leave them out",
+        ),
+    ],
+)
+def test_numbers_that_no_instrument_measures(
+    tactomo: Run, tmp_path: Path, arrays: dict[str, Any], told: str
+) -> None:
+    np.savez(tmp_path / "odd.npz", **arrays)
+    assert told in tactomo("evaluate", "measured", tmp_path / "odd.npz", status=1).stderr
+
+
 def test_a_sensor_that_is_no_tank_is_refused_before_the_work(tactomo: Run, tmp_path: Path) -> None:
     empty = np.zeros(0)
     np.savez(tmp_path / "tanks.npz", dv=empty, truth=empty, name=empty)

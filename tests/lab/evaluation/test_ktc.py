@@ -100,7 +100,12 @@ def test_the_unit_of_the_voltages_does_not_matter(simulated: Arrays, tmp_path: P
         ("voltages", lambda a: a * np.nan, "no reading that is a number"),
         ("injection", lambda a: a[:, :16], "injection is"),
         ("truth", lambda a: a + 1, "other values"),
+        ("truth", lambda a: a[0, 0, 0], "single number"),
+        ("injection", lambda a: a * 1j, "none that is real"),
+        ("voltages", lambda a: a * 1e308, "beyond 1e"),
         ("level", lambda a: a[:2], "level is"),
+        ("level", lambda a: a * np.nan, "0 to 7"),
+        ("level", lambda a: a.astype(str), "0 to 7"),
     ],
 )
 def test_what_is_no_challenge(

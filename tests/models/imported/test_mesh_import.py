@@ -120,6 +120,25 @@ def test_voltages_in_another_order_are_told(tmp_path: Path, disc: Any) -> None:
     assert "--pattern 16:opposite:adjacent:rotated" in model.pattern.note
 
 
+@pytest.mark.parametrize(
+    ("array", "value"),
+    [
+        ("node", np.nan),
+        ("node", 1e308),
+        ("node", 0),
+        ("element", 0),
+        ("ex_mat", np.inf),
+        ("ex_mat", 1e308),
+    ],
+)
+def test_a_damaged_model_is_told(tmp_path: Path, disc: Any, array: str, value: float) -> None:
+    with np.load(saved(tmp_path / "tank.npz", disc, protocol.create(16, 1, 1, "std"))) as held:
+        arrays = {**held, array: np.full(held[array].shape, value)}
+    np.savez(tmp_path / "tank.npz", **arrays)
+    with pytest.raises(DataError):
+        read_model(tmp_path / "tank.npz", RADIUS_MM)
+
+
 def test_what_no_description_can_have_is_refused_by_name(tmp_path: Path, disc: Any) -> None:
     made = protocol.create(16, 1, 1, "std")
     path = saved(tmp_path / "tank.npz", disc, made)
