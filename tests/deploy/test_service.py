@@ -133,6 +133,7 @@ def test_a_dry_run_shows_all_and_does_nothing(install: Run, disk: Path) -> None:
     said = install("palm", "/dev/ttyACM0", more=("--dry-run",))
     assert said.returncode == 0
     assert files_of(disk) == before
+    assert said.stderr == "No USB adapter is at /dev/ttyACM0: the service keeps this name.\n\n"
     for file in ("tactomo@.service", "71-tactomo.rules", "palm.toml"):
         assert re.search(rf"^write .*{file}$", said.stdout, re.M)
     assert "    WatchdogSec=" in said.stdout

@@ -66,6 +66,9 @@ def install(
 
     check_sensor_name(name, "skin")
     rules, names = udev.rules(name, port, list_adapters())
+    for unnamed in set(port).intersection(names):
+        if not unnamed.startswith(("/dev/serial/", "/dev/tactomo/")):
+            say(f"No USB adapter is at {unnamed}: the service keeps this name.\n", err=True)
     root = root.absolute()
     plan = plan_install(name, names, rules, root, program or _program(dry_run))
     _carry_out(plan, dry_run)
