@@ -18,7 +18,9 @@ ARCH=$(dpkg --print-architecture)
 PYTHON_PACKAGE=$("$PYTHON" -c 'import sys; print("python%d.%d" % sys.version_info[:2])')
 
 work=$(mktemp -d)
-trap 'rm -rf "$work"' EXIT
+commit=daemon/tactomo/commit.txt  # of which `tactomo --version` tells
+trap 'rm -rf "$work" "$commit"' EXIT
+git describe --always --dirty --abbrev=12 > "$commit" || rm -f "$commit"
 root=$work/root
 venv=$root$HOME_DIR
 mkdir -p "$venv" dist
