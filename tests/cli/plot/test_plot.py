@@ -94,6 +94,20 @@ def test_a_pressure_between_two_unknown_ones_is_seen(tmp_path: Path) -> None:
     assert [y for line in dots for y in line.get_ydata()] == [150.0]
 
 
+@pytest.mark.parametrize("what", ["pressure", "force"])
+def test_a_lower_bound_is_on_no_line(tmp_path: Path, what: str) -> None:
+    def change(number: int) -> dict[str, Any]:
+        of = "above" if number == 30 else "within"
+        contacts = [replace(c, pressure_range=of, force_n=90.0) for c in contacts_of(30)]
+        return {"contacts": [asdict(c) for c in contacts]}
+
+    axes = drawn(write_grasp(tmp_path / "a.mcap", change=change), what)
+    (marks,) = [line for line in axes.lines if line.get_marker() == "^"]
+    (at_s,) = marks.get_xdata()
+    lines = [line for line in axes.lines if line.get_linestyle() == "-"]
+    assert not [y for line in lines for x, y in line.get_xydata() if x == at_s and y == y]
+
+
 def test_some_panels_of_some_seconds(tactomo: Run, grasp: Path) -> None:
     result = tactomo(
         *("plot", grasp, "-o", "some.png", "--what", "path, pressure"),

@@ -228,7 +228,7 @@ def _draw_pressure(axes: Any, course: Course, colours: dict[str, Any]) -> None:
     contacts = [contact for track in course.tracks.values() for contact in track.contacts]
     if any(c.pressure_kpa is not None or c.pressure_range == "below" for c in contacts):
         _draw_quantity(axes, course, colours, "pressure_kpa", "pressure_sigma_kpa")
-        _draw_out_of_range(axes, course, colours)
+        _draw_light(axes, course, colours)
         axes.set_ylabel("pressure (kPa)")
     elif any(contact.magnitude is not None for contact in contacts):
         _draw_quantity(axes, course, colours, "magnitude", "magnitude_sigma")
@@ -239,8 +239,8 @@ def _draw_pressure(axes: Any, course: Course, colours: dict[str, Any]) -> None:
     axes.set_ylim(bottom=0)
 
 
-def _draw_out_of_range(axes: Any, course: Course, colours: dict[str, Any]) -> None:
-    """Mark when a contact is too light to be measured, along the bottom, or beyond the range."""
+def _draw_light(axes: Any, course: Course, colours: dict[str, Any]) -> None:
+    """Mark along the bottom when a contact is too light to be measured; explain all marks."""
     across = axes.get_xaxis_transform()
     lights = 0
     for name, track in course.tracks.items():
@@ -256,10 +256,6 @@ def _draw_out_of_range(axes: Any, course: Course, colours: dict[str, Any]) -> No
                 transform=across,
                 label="touched, pressure unknown",
             )
-        beyond = [(t, c.pressure_kpa) for t, c in _pairs(track) if c.pressure_range == "above"]
-        if beyond:
-            mark = {"color": colours[name], "markersize": 3, "label": "at least"}
-            axes.plot(*zip(*beyond, strict=True), "^", **mark)
     told = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     if told:
         axes.legend(told.values(), told, fontsize=7, loc="center left", handlelength=1.2)
@@ -274,11 +270,15 @@ def _draw_force(axes: Any, course: Course, colours: dict[str, Any]) -> None:
 def _draw_quantity(
     axes: Any, course: Course, colours: dict[str, Any], name: str, sigma_name: str
 ) -> None:
-    """Draw one number of each contact over time, with its uncertainty as a band."""
+    """Draw one number of each contact over time, with its uncertainty as a band.
+
+    Lower bounds of pressures and forces are marks without a line.
+    """
     for identity, track in course.tracks.items():
         known = [(t, c) for t, c in _pairs(track) if getattr(c, name) is not None]
         times = [t for t, _ in known]
-        values = [getattr(c, name) for _, c in known]
+        values = [None if _is_bound(c, name) else getattr(c, name) for _, c in known]
+        bounds = [(t, getattr(c, name)) for t, c in known if _is_bound(c, name)]
         sigmas = [getattr(c, sigma_name) for _, c in known]
         spread = [math.nan if sigma is None else SIGMAS * sigma for sigma in sigmas]
         xs, ys = _broken(times, values)
@@ -287,6 +287,13 @@ def _draw_quantity(
         axes.plot(xs, ys, linewidth=1.1, **style)
         axes.plot(*_alone(xs, ys), ".", markersize=3, **style)
         axes.fill_between(xs, ys - bands, ys + bands, alpha=0.22, linewidth=0, **style)
+        if bounds:
+            axes.plot(*zip(*bounds, strict=True), "^", markersize=3, label="at least", **style)
+
+
+def _is_bound(contact: Contact, name: str) -> bool:
+    """Whether a pressure or force is a lower bound."""
+    return name in ("pressure_kpa", "force_n") and contact.pressure_range == "above"
 
 
 def _pairs(track: Track) -> list[tuple[float, Contact]]:
