@@ -17,6 +17,7 @@ from tactomo_models.sensor.pattern import reciprocal_pairs
 
 NOISE_SCANS = 4096  # of a longer file, so many tell the noise
 TRUSTED_SCANS = 20  # a variance from as many is known to a third
+MIN_TREND_SCANS = 10  # fewer may lie on a line by chance where gain noise moves all voltages alike
 
 
 @dataclass(frozen=True)
@@ -153,12 +154,19 @@ def noise_of_scans(scans: FloatArray) -> FloatArray | None:
     A converter's noise is much the same on every measurement while a few scans know each one
     poorly, so what is common counts as much as `TRUSTED_SCANS` scans of the measurement's own.
     The common variance is a median: a lead that picks up interference is not the others' noise.
+    Where a straight line takes most of the variance, the skin creeps: that is no noise.
     """
     if len(scans) < 2:
         return None
     from scipy.special import chdtri  # a third of the start of `tactomo info`
 
     own, freedom = scans.var(axis=0, ddof=1), len(scans) - 1
+    if len(scans) >= MIN_TREND_SCANS:
+        line = np.linspace(-1, 1, len(scans))
+        trend = (line @ (scans - scans.mean(axis=0))) ** 2 / (line @ line)
+        about_line = np.maximum(own * freedom - trend, 0.0) / (freedom - 1)
+        if about_line.sum() < own.sum() / 2:
+            own, freedom = about_line, freedom - 1
     common = float(np.median(own)) * freedom / chdtri(freedom, 0.5)
     share = len(scans) / (len(scans) + TRUSTED_SCANS)
     return np.asarray(np.sqrt(share * own + (1 - share) * common))

@@ -65,3 +65,16 @@ def test_a_voltage_without_bounds_says_nothing(paper: SensorDescription) -> None
     found = repeats.find(Channel.MAGNITUDE, live(), reference)
     assert found is not None
     assert not found.voltages.any()
+
+
+def test_a_skin_that_crept_at_its_tare_is_not_taken_for_frozen_afterwards(
+    paper: SensorDescription,
+) -> None:
+    """What lies on a line was no noise; what its converter has beside the line is."""
+    creeping = np.array([live() * (1 + 2e-4 * number) for number in range(20)])
+    reference, repeats = Reference.from_scans(creeping, None), Repeats(paper.pairs)
+    assert reference.magnitude_noise is not None
+    assert np.median(reference.magnitude_noise) == pytest.approx(NOISE, rel=0.1)
+    for _ in range(40):
+        found = repeats.find(Channel.MAGNITUDE, live(), reference)
+        assert found is None or not found.voltages.any()
