@@ -130,6 +130,40 @@ def test_a_tare_under_a_press(
 
 
 @pytest.mark.faults
+@pytest.mark.fault(
+    "A tare while one channel creeps",
+    "the channel is used afterwards, and a contact shows in every frame",
+    "the magnitude channel rises by 0.2 % a second for 6 s, tared meanwhile; then 3 s at rest and "
+    "3 s of a contact of 180 kPa, 20 dual scans/s",
+)
+def test_a_tare_while_a_channel_creeps(
+    tared: StartProcess, scenes: Scenes, play: Play, listen: Listen, figure: Figure
+) -> None:
+    daemon = tared()
+    ears = listen(daemon)
+    magnitude = Channel.MAGNITUDE
+    creep = [
+        {**scenes.rest, magnitude: scenes.rest[magnitude] * (1 + 1e-4 * n)} for n in range(120)
+    ]
+    creeping = play(iter(creep))
+    ears.wait(lambda _: True, "a frame")
+    daemon.ask("tare")
+    creeping.join()
+    first = len(ears.heard)
+    play(itertools.repeat(scenes.rest, 60)).join()
+    pressed = len(ears.heard)
+    play(itertools.repeat(scenes.one[0], 60)).join()
+    frames = ears.heard[first:]
+    missing = sum("magnitude_missing" in heard.fields["flags"] for heard in frames)
+    shown = sum(len(heard.fields["contacts"]) == 1 for heard in ears.heard[pressed + 3 :])
+    later = len(ears.heard) - pressed - 3
+    figure(f"{missing} of {len(frames)} frames without the channel; {shown} of {later} show it")
+    assert missing == 0
+    assert shown == later > 20
+    assert not daemon.told("converter_frozen")
+
+
+@pytest.mark.faults
 @pytest.mark.measure(
     "A palm that comes lightly: a pad of 80 mm to 20 kPa within 30 s",
     "no promise",

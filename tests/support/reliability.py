@@ -45,6 +45,8 @@ These limits remain:
 - A wide press that begins lightly may be missing in its first frames.
 - Scans that one board delays by half a second behind an honest counter can make a sliding press
   look like drift, or like two contacts: pressures and places are then wrong, without a flag.
+- A board that averages its scans over 20 mm of a sliding press can show it as two, without a
+  flag.
 - A structure port that reads the magnitude sheet, too, looks like a skin at rest: presses that the
   magnitude sheet does not feel are missing, without a flag. Harder presses are flagged.
 - Where one daemon reads the magnitude sheet of one skin and the structure sheet of another, a press
