@@ -315,6 +315,10 @@ def around(radius_m: float) -> dict[str, Any]:
     return {"frame": "left_forearm_link", "kind": "cylinder", "surface_m": rows}
 
 
+NUMBER_AT = """
+    const { labels: [[, number]], body, camera } = tactomo.surface;
+    const { x, y } = number.position.clone().applyMatrix4(body.matrixWorld).project(camera);
+    return Math.max(Math.abs(x), Math.abs(y))"""
 SEEN = "return tactomo.surface.mmToPixel(arguments[0], arguments[1])"
 
 
@@ -327,6 +331,7 @@ def test_a_mounted_sheet_is_pressed_and_turned_on_its_surface(page: Page) -> Non
             position_m=(0.037, -0.0146, 0.02),
             normal=(0.93, -0.366, 0.0),
             frame="left_forearm_link",
+            force_n=100.0,
         )
     ]
     page.open()
@@ -367,6 +372,10 @@ def test_a_mounted_sheet_is_pressed_and_turned_on_its_surface(page: Page) -> Non
     left = page.js(SEEN, -40, -30)[0]
     page["surface"].send_keys(Keys.ARROW_LEFT)
     wait_until(lambda: page.js(SEEN, -40, -30)[0] < left - 2)
+    page.js("tactomo.surface.distance = 2.2")  # as by the wheel: the arrow leaves the picture
+    for _ in range(8):  # the number of the contact is never cut off
+        page["surface"].send_keys(Keys.ARROW_RIGHT)
+        wait_until(lambda: page.js(NUMBER_AT) < 0.95)
     page.skin.status = page.skin.status | {"description": DESCRIPTION}
     wait_until(lambda: not page["surface"].is_displayed())
 

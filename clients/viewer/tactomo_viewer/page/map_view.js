@@ -236,7 +236,7 @@ export class MapView {
     const { left, top, width: w, height: h } = this.plot;
     const end = this.plot.narrow ? this.size[0] : left + w;
     const [right, above, below] = [Math.min(x + 10, end - width - 2), y - 34, y + 12];
-    const beside = Math.max(2, x - 10 - width);
+    const beside = Math.max(left + 2, x - 10 - width);
     const spots = [above, below, above - LABEL_HEIGHT, below + LABEL_HEIGHT]
       .flatMap((spot) => [[right, spot], [beside, spot]])
       .filter(([, spot]) => spot >= top && spot + LABEL_HEIGHT <= top + h);

@@ -12,6 +12,7 @@ const LARGEST_ARROW = 0.45;     // of the surface's radius, at the top of the sc
 const LEAST_ARROW = 0.12;
 const FULL_FORCE_N = 100;       // a firm push of a hand; larger forces have the largest arrow
 const LIFT = 0.004;             // of the radius: what lies on the surface is not hidden by it
+const SEEN = 0.93;              // of the picture's half width: where a number is not cut off
 const RING_POINTS = 48;
 const CUT_OUT_PX = 1024;
 const EDGE_STEPS = 24;          // of an edge of the outline, which follows the surface
@@ -89,12 +90,14 @@ export class SurfaceView {
     if (!this.rows) return;
     this.#colour(scene);
     this.#clearMarks();
+    this.camera.position.set(0, 0, this.distance);
+    this.camera.updateMatrixWorld();
+    this.body.updateMatrixWorld();
     const theme = getComputedStyle(this.canvas);
     this.#rim(theme.getPropertyValue("--axis").trim());
     this.#electrodes(theme.getPropertyValue("--electrode").trim());
     for (const press of scene.presses) this.#press(press, theme.getPropertyValue("--pressing").trim());
     for (const contact of scene.frame?.contacts ?? []) this.#contact(contact);
-    this.camera.position.set(0, 0, this.distance);
     this.renderer.render(this.scene, this.camera);
   }
 
@@ -264,8 +267,15 @@ export class SurfaceView {
     const colour = contactColour(contact.id);
     this.marks.add(new THREE.ArrowHelper(out.clone().negate(), from, length, colour, 0.09, 0.06));
     const label = this.#label(contact.id, colour);
-    label.position.copy(from.addScaledVector(out, 0.07));
+    // Where the arrow leaves the picture, the number stays in it.
+    const along = [1, 0.75, 0.5, 0.25, 0].map((share) => foot.clone().addScaledVector(out, share * length + 0.07));
+    label.position.copy(along.find((spot) => this.#isSeen(spot)) ?? along.at(-1));
     this.marks.add(label);
+  }
+
+  #isSeen(spot) {
+    const { x, y } = spot.clone().applyMatrix4(this.body.matrixWorld).project(this.camera);
+    return Math.max(Math.abs(x), Math.abs(y)) < SEEN;
   }
 
   #label(id, colour) {
