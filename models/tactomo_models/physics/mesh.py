@@ -14,7 +14,7 @@ import skfem
 from scipy.spatial import Delaunay
 from scipy.spatial.distance import pdist
 
-from tactomo_models.arrays import FloatArray, IntArray
+from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.errors import DescriptionError
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.outline import Pad, RimElectrode
@@ -86,13 +86,24 @@ def _rectangle(description: SensorDescription, spacing_m: float | None) -> skfem
     x, y = _grid(description, spacing_m)
     nx, ny = len(x), len(y)
     points = np.stack([np.tile(x, ny), np.repeat(y, nx)])
-    corner = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).ravel()
-    a, b, c, d = corner, corner + 1, corner + nx + 1, corner + nx
-    # Diagonals alternate, so that the mesh prefers no direction.
-    even = (corner // nx + corner % nx) % 2 == 0
-    first = np.where(even, np.stack([a, b, c]), np.stack([a, b, d]))
-    second = np.where(even, np.stack([a, c, d]), np.stack([b, c, d]))
-    return skfem.MeshTri(points, np.hstack([first, second]))
+    row, column = np.divmod(np.arange((nx - 1) * (ny - 1)), nx - 1)
+    triangles = _halves(np.arange(nx * ny).reshape(ny, nx), row, column)
+    return skfem.MeshTri(points, np.ascontiguousarray(triangles.T))
+
+
+def _halves(nodes: IntArray, row: IntArray, column: IntArray) -> IntArray:
+    """Triangles (2 n, 3) of squares of regular nodes, of which each has a row and a column.
+
+    Their diagonals alternate, so that the mesh prefers no direction: with diagonals by chance,
+    single presses without noise on an insole were told with elongations off by 0.03 and places by
+    0.1 mm.
+    """
+    a, b = nodes[row, column], nodes[row, column + 1]
+    c, d = nodes[row + 1, column + 1], nodes[row + 1, column]
+    even = ((row + column) % 2 == 0)[:, None]
+    first = np.where(even, np.stack([a, b, c], axis=1), np.stack([a, b, d], axis=1))
+    second = np.where(even, np.stack([a, c, d], axis=1), np.stack([b, c, d], axis=1))
+    return np.concatenate([first, second])
 
 
 def _disc(description: SensorDescription, spacing_m: float | None) -> skfem.MeshTri:
@@ -123,6 +134,7 @@ def _polygon(description: SensorDescription, spacing_m: float | None) -> skfem.M
     outline = description.sheet.outline
     x, y = _grid(description, spacing_m)
     step_m = max(x[1] - x[0], y[1] - y[0])
+    shape = len(y), len(x)
     x, y = (each.ravel() for each in np.meshgrid(x, y))
     deep = outline.depth(x, y) > MIN_DEPTH * step_m
     inner = np.stack([x[deep], y[deep]], axis=1)
@@ -130,7 +142,7 @@ def _polygon(description: SensorDescription, spacing_m: float | None) -> skfem.M
         _rim_nodes(description, ring, 2 * MIN_DEPTH * step_m)
         for ring in range(len(outline.lengths_m))
     ]
-    # The diagonal of a square of nodes is chosen by rounding: by chance, it prefers no direction.
+    # Of nodes in a square rounding would choose the triangles, and not all of them would fit.
     shaken = inner + 1e-7 * step_m * np.random.default_rng(0).uniform(-1, 1, inner.shape)
     for _ in range(ROUNDS):
         rim = np.concatenate(rings)
@@ -154,6 +166,7 @@ def _polygon(description: SensorDescription, spacing_m: float | None) -> skfem.M
             "to be meshed: leave out details smaller than an electrode"
         )
     points = np.concatenate([rim, inner])
+    triangles = _regular(triangles, len(rim), deep.reshape(shape))
     corners = points[triangles]
     one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = np.abs(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0]) / 2
@@ -168,6 +181,26 @@ def _polygon(description: SensorDescription, spacing_m: float | None) -> skfem.M
         np.ascontiguousarray(points[used].T),
         np.ascontiguousarray(renumbered.reshape(triangles.shape).T),
     )
+
+
+def _regular(triangles: IntArray, rim: int, deep: BoolArray) -> IntArray:
+    """The same triangles (n, 3), but for squares of regular nodes: these are halved in turn.
+
+    Args:
+        triangles: of nodes along the rim, so many, and of regular ones after them, row by row.
+        rim: number of nodes along the rim.
+        deep: (rows, columns) which regular nodes are meshed.
+    """
+    nodes = np.full(deep.shape, -1)
+    nodes[deep] = rim + np.arange(np.count_nonzero(deep))
+    is_whole = deep[:-1, :-1] & deep[:-1, 1:] & deep[1:, :-1] & deep[1:, 1:]
+    places = np.concatenate([np.full((rim, 2), -9), np.argwhere(deep)])
+    corners = places[triangles]  # (n, 3, 2) rows and columns
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    is_half = (low >= 0).all(axis=1) & (high - low == 1).all(axis=1)
+    is_half[is_half] = is_whole[tuple(low[is_half].T)]
+    squares = np.unique(low[is_half], axis=0)
+    return np.concatenate([triangles[~is_half], _halves(nodes, *squares.T)])
 
 
 def _rim_nodes(description: SensorDescription, ring: int, step_m: float) -> FloatArray:
