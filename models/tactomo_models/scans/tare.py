@@ -259,7 +259,7 @@ class ChannelTare:
         changes = Changes(
             change=change,
             weight=valid / np.sqrt(noise + error),
-            variance_inflation=inflated(error / (noise + error), valid, self._modes),
+            variance_inflation=inflated(error / (noise + error), valid),
             noise_variance=noise,
             tolerance=still_share * error,
             modes=self._modes,
