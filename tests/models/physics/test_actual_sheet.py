@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tactomo_models import Flag, Press, Reference, SensorDescription, SkinSimulator
+from tactomo_models import (
+    Flag,
+    Press,
+    Reference,
+    SensorDescription,
+    SkinSimulator,
+    load_description,
+)
 from tactomo_models.arrays import FloatArray
 from tactomo_models.health.diagnosis import diagnose
 from tactomo_models.health.findings import Level
 from tactomo_models.physics.actual_sheet import SheetEstimator
-from tactomo_models.physics.artifact import Artifact
+from tactomo_models.physics.artifact import Artifact, load_or_build_artifact
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.reconstruct import Reconstructor
 from tactomo_protocol import Channel
@@ -50,6 +57,28 @@ def test_a_hand_made_sheet_is_found_by_its_reference(
     assert found is not None
     assert off(voltages, ForwardModel(paper, artifact.bare)) > 0.05
     assert off(voltages, found) < 0.005
+
+
+def test_voltages_that_are_all_noise_do_not_keep_a_sheet_from_being_found() -> None:
+    """On a long sheet most voltages are far from their drive: noise gives them their signs."""
+    insole = load_description("insole")
+    bare = load_or_build_artifact(insole).bare
+    skin = SkinSimulator(insole, unevenness=0.05, impedance_spread=0.2, seed=3)
+    voltages = skin.voltages([])[Channel.MAGNITUDE]
+    noise = 3e-4 * float(np.sqrt(np.mean(voltages**2)))
+    seen = voltages + noise * np.random.default_rng(2).standard_normal(len(voltages))
+    assert (np.sign(seen) != np.sign(voltages)).any()
+    estimator, every = SheetEstimator(insole, bare), np.ones(len(voltages), bool)
+    found = estimator.estimate(seen, every, noise / np.abs(seen))
+    assert found is not None
+    clear = np.abs(voltages) > 100 * noise
+    even = ForwardModel(insole, bare).bare_voltages
+
+    def off_by(told: FloatArray) -> float:
+        ratio = voltages[clear] / told[clear]
+        return float(np.std(ratio / np.median(ratio)))
+
+    assert off_by(found.bare_voltages) < off_by(even) / 5
 
 
 @pytest.mark.slow

@@ -57,6 +57,19 @@ def test_every_map_node_inside_is_a_mesh_node(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", POLYGONS)
+def test_squares_of_nodes_are_halved_in_turn(name: str) -> None:
+    """So that the mesh prefers no direction: nodes have eight neighbours and four by turns."""
+    sensor = load_description(name)
+    mesh = mesh_sheet(sensor, refinements=0).mesh
+    steps = np.array([np.diff(sensor.map_x_m)[0], np.diff(sensor.map_y_m)[0]])
+    deep = sensor.on_sheet(*mesh.p, float(3 * steps.max()))
+    column, row = np.round((mesh.p.T - [sensor.map_x_m[0], sensor.map_y_m[0]]) / steps).T[:, deep]
+    neighbours = np.bincount(mesh.facets.ravel())[deep]
+    by_turns = {tuple(np.unique(neighbours[(column + row) % 2 == odd])) for odd in (0, 1)}
+    assert by_turns == {(4,), (8,)}
+
+
+@pytest.mark.parametrize("name", POLYGONS)
 def test_the_rim_is_followed(name: str) -> None:
     sensor = load_description(name)
     sheet = mesh_sheet(sensor)
