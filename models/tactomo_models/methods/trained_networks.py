@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import os
+import zlib
 from base64 import b64decode
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 from weakref import WeakValueDictionary
+from zipfile import BadZipFile
 
 import numpy as np
 from tactomo_protocol import Channel
@@ -121,14 +123,22 @@ class FusionNetwork:
 
     Args:
         network: of the kind `FUSION`.
+
+    Raises:
+        ArtifactError: what it notes on itself is damaged.
     """
 
     def __init__(self, network: Network) -> None:
         magnitude_error = 0.1  # of the range: two in three of our network's err by no more
         self._network = network
-        self._sigma = magnitude_error * float(network.notes["scale"])
-        #: (M, K) of each channel's prefilter
-        self.bases = bases_of(network.notes)
+        try:
+            self._sigma = magnitude_error * float(network.notes["scale"])
+            #: (M, K) of each channel's prefilter
+            self.bases = _bases_of(network)
+        except (KeyError, ValueError, EOFError, OSError, BadZipFile, zlib.error) as error:
+            raise ArtifactError(
+                f"{network.path}: what it notes on itself is damaged; copy or train it anew"
+            ) from error
         self._filters: dict[Channel, tuple[bytes, Prefilter]] = {}
         self._mute = {
             name: prefilter(basis, np.zeros(len(basis))) for name, basis in self.bases.items()
@@ -174,15 +184,18 @@ class FusionNetwork:
         return self._filters[name][1]
 
 
-def bases_of(notes: Mapping[str, str]) -> dict[Channel, FloatArray]:
-    """Bases (M, K) of the prefilters that our network's notes on itself have, by channel.
+def _bases_of(network: Network) -> dict[Channel, FloatArray]:
+    """Bases (M, K) of the prefilters that a network's notes on itself have, by channel.
 
     Raises:
-        KeyError: there are none.
-        ValueError: they are damaged.
+        KeyError: there are none of a channel.
+        ValueError, EOFError, OSError, BadZipFile, zlib.error: they are damaged.
     """
-    bases = np.load(io.BytesIO(b64decode(notes["bases"])), allow_pickle=False)
-    return {name: bases[name].astype(np.float64) for name in Channel if name in bases}
+    kept = np.load(io.BytesIO(b64decode(network.notes["bases"])), allow_pickle=False)
+    bases = {name: kept[name].astype(np.float64) for name in network.channels}
+    if any(basis.ndim != 2 or not np.isfinite(basis).all() for basis in bases.values()):
+        raise ValueError("bases are (M, K), and finite")
+    return bases
 
 
 class SensorNetworks:

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from base64 import b64decode
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,8 @@ from tactomo_models.methods.trained_networks import (
     own_path,
 )
 from variants import variant
+
+Rewrite = Callable[[bytes], bytes]
 
 ONE = Press(0.02, -0.03, 180.0)
 THREE = (Press(-0.04, 0.03, 180.0), Press(0.03, 0.035, 160.0), ONE)
@@ -123,6 +126,27 @@ def test_a_truncated_network_and_other_files_are_refused(
     broken.write_bytes(cut)
     with pytest.raises(ArtifactError, match=r"broken\.onnx"):
         Network(broken, paper, "network")
+
+
+@pytest.mark.parametrize(
+    ("note", "as_long"),
+    [
+        ("scale", lambda old: b"x" * len(old)),
+        ("bases", lambda old: b"!" * len(old)),
+        ("bases", lambda old: b"A" * len(old)),
+        ("bases", lambda old: old[: len(old) // 2] + b"=" * (len(old) - len(old) // 2)),
+    ],
+)
+def test_a_network_with_damaged_notes_is_refused(
+    shipped: Path, paper: SensorDescription, tmp_path: Path, note: str, as_long: Rewrite
+) -> None:
+    whole = shipped.read_bytes()
+    old = load_network(paper, "network").notes[note].encode()
+    at = whole.index(old, whole.index(note.encode()))
+    path = tmp_path / "damaged.onnx"
+    path.write_bytes(whole[:at] + as_long(old) + whole[at + len(old) :])
+    with pytest.raises(ArtifactError, match="damaged"):
+        FusionNetwork(load_network(paper, "network", path=path))
 
 
 def test_networks_of_a_description_as_it_was_are_said_to_be(

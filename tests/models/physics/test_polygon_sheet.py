@@ -62,7 +62,7 @@ def test_squares_of_nodes_are_halved_in_turn(name: str) -> None:
     sensor = load_description(name)
     mesh = mesh_sheet(sensor, refinements=0).mesh
     steps = np.array([np.diff(sensor.map_x_m)[0], np.diff(sensor.map_y_m)[0]])
-    deep = sensor.on_sheet(*mesh.p, float(3 * steps.max()))
+    deep = sensor.on_sheet(mesh.p[0], mesh.p[1], float(3 * steps.max()))
     column, row = np.round((mesh.p.T - [sensor.map_x_m[0], sensor.map_y_m[0]]) / steps).T[:, deep]
     neighbours = np.bincount(mesh.facets.ravel())[deep]
     by_turns = {tuple(np.unique(neighbours[(column + row) % 2 == odd])) for odd in (0, 1)}
