@@ -87,6 +87,10 @@ def test_a_press_becomes_a_contact_there_and_what_the_sheet_cannot_tell_is_absen
 def test_a_method_that_needs_what_the_sheet_lacks_is_refused(one_sheet: tuple[Demo, str]) -> None:
     demo, channel = one_sheet
     with Daemon(demo.control) as daemon:
+        offered = daemon.status().methods
+        assert {"auto", "tikhonov", "noser", "fit"} <= set(offered)
+        assert "network" not in offered
+        assert ("levelset" in offered) == (channel == "structure")
         with pytest.raises(NoNetwork, match="both channels"):
             daemon.set_method("network")
         if channel == "magnitude":

@@ -828,8 +828,8 @@ class Status(Received):
     #: Processing time of each stage of the pipeline
     stage_ms: Mapping[str, Percentiles] = field(default_factory=dict)
     latency_ms: Percentiles | None = None  #: Time from the last byte read to publication
-    #: The methods that ``set_tier`` takes: ``auto``, tactomo's own, and methods installed or named
-    #: at the daemon's start
+    #: The methods that the sensor can be reconstructed by: ``auto``, tactomo's own, and methods
+    #: installed or named at the daemon's start
     methods: tuple[str, ...] = ()
     tier_requested: str = ""  #: The requested method, one of `methods`
     #: Requested work per frame, in milliseconds of a 2.5 GHz core; nil: the method's own

@@ -56,7 +56,7 @@ from tactomo_models.calibration.calibration_file import (
     calibration_for,
 )
 from tactomo_models.calibration.taught_skin import TAUGHT, TaughtSkin
-from tactomo_models.methods.registry import available_methods, check_method
+from tactomo_models.methods.registry import available_methods, check_method, left_out
 from tactomo_models.sensor.description_file import carried_text
 from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
@@ -140,6 +140,8 @@ class Daemon:
             )
         self._description = description
         self._methods = tuple(dict.fromkeys((*available_methods(), config.method)))
+        why = left_out(self._methods, description)
+        self._offered = tuple(method for method in self._methods if method not in why)
         replay = read_replay(config.ports, description)
         if replay is not None and config.calibration is not None:
             replay = replace(replay, marks=without_calibrations(replay.marks))
@@ -235,7 +237,7 @@ class Daemon:
             self._imaging,
             self._recorder,
             self._events,
-            self._methods,
+            self._offered,
             self.playback,
         )
         self._access: AccessControl | None = None
@@ -409,7 +411,7 @@ class Daemon:
         if method not in self._methods:
             raise CommandError(
                 f"there is no method {method!r}",
-                f"use one of: {', '.join(self._methods)}",
+                f"use one of: {', '.join(self._offered)}",
                 "bad_argument",
             )
         try:

@@ -156,16 +156,12 @@ def usable(sensor: SensorDescription, methods: Sequence[str]) -> list[str]:
 
     Raises TactomoError where none does.
     """
-    from tactomo_models import ModelError
-    from tactomo_models.methods.registry import check_method
+    from tactomo_models.methods.registry import left_out
 
-    found = []
-    for method in methods:
-        try:
-            check_method(method, sensor)
-            found.append(method)
-        except ModelError as error:  # such as a network that nobody trained
-            say(f"left out: {method}: {error}", err=True)
+    why = left_out(methods, sensor)
+    for method, error in why.items():
+        say(f"left out: {method}: {error}", err=True)
+    found = [method for method in methods if method not in why]
     if not found:
         raise TactomoError("none of the methods is available", "choose others with --method")
     return found

@@ -13,12 +13,12 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 from importlib.metadata import entry_points
 from typing import Any, Final
 
-from tactomo_models.errors import MethodError
+from tactomo_models.errors import MethodError, ModelError
 from tactomo_models.methods.method import Method
 from tactomo_models.sensor.description import SensorDescription
 
@@ -119,6 +119,17 @@ def check_method(name: str, description: SensorDescription) -> None:
     check = getattr(found, "check", None)
     if check is not None:
         check(description)
+
+
+def left_out(methods: Iterable[str], description: SensorDescription) -> dict[str, ModelError]:
+    """Why some of the methods cannot reconstruct a sensor, by their names."""
+    why: dict[str, ModelError] = {}
+    for name in methods:
+        try:
+            check_method(name, description)
+        except ModelError as error:  # such as a network that nobody trained
+            why[name] = error
+    return why
 
 
 @cache
