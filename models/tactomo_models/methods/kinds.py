@@ -20,6 +20,7 @@ from tactomo_models.scene.parameters import (
     E1,
     E2,
     EDGE,
+    FALLING_SHARE,
     HARMONIC,
     HERTZ,
     HOLE,
@@ -52,7 +53,7 @@ class Kind(StrEnum):
 # tried, all alike and 0.4, 0.3, 0.2, 0.1 (even, falling, rounded, ring), whose maps correlate on
 # tuning rows by: mixed 0.976, 0.961; soft 0.965, 0.979; soft on hand-made skins 0.964, 0.974;
 # crowds 0.960, 0.975; moving 0.989, 0.996; ordinary 0.985, 0.986; 10 dB 0.888, 0.896.
-SHARES = {Kind.EVEN: 0.35, Kind.FALLING: 0.3, Kind.ROUNDED: 0.2, Kind.RING: 0.15}
+SHARES = {Kind.EVEN: 0.35, Kind.FALLING: FALLING_SHARE, Kind.ROUNDED: 0.2, Kind.RING: 0.15}
 
 
 # Of all kinds together, how many contacts would tell as much of what presses as these shares do: as

@@ -13,6 +13,7 @@ MAX_BULGE = 0.25
 # Of an edge that is not flat: what falls less shows nothing but the sheet's errors.
 EDGE_LIMITS = (0.3, 1.0)
 HERTZ = 0.5
+FALLING_SHARE = 0.3  # of presses, before any data: see `methods.kinds.SHARES`
 # Place, size, elongation and bulges; the peak half of the table, which is made for such presses
 # (all of it loses 0.003 of the correlation on mixed presses, 0.3 on ordinary ones); edges as of
 # balls and fingers, holes of what presses with its rim.

@@ -11,10 +11,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum, auto
+from functools import cached_property
 
 import numpy as np
 
 from tactomo_models.arrays import BoolArray, FloatArray
+from tactomo_models.scene.parameters import FALLING_SHARE
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.response import MagnitudeResponse
 
@@ -71,7 +73,7 @@ class FieldContacts:
     mean_sigma_kpa: FloatArray
     force_n: FloatArray  # (K,) forces
     force_sigma_n: FloatArray  # (K,) standard uncertainties
-    edge: FloatArray  # (K,) gamma; 0 flat, 1/2 Hertz
+    edge: FloatArray  # (K,) gamma; 0 flat, 1/2 Hertz; NaN where nobody has told
     total_force_n: float  # of all contacts together
     # its standard uncertainty: less than that of its parts where they touch
     total_force_sigma_n: float
@@ -93,6 +95,20 @@ class PressureCurve:
         rising = np.append(True, np.diff(size[onset:]) > 0)  # of one change, the least pressure
         kpa = np.asarray(response.pressure_kpa)[onset:][rising]
         return cls(size[onset:][rising], kpa, np.zeros(len(kpa)))
+
+    @cached_property
+    def falling(self) -> PressureCurve:
+        """Peaks of presses that fall as Hertz's do, over the mean magnitude of their area.
+
+        K. L. Johnson, "Contact Mechanics" (1985), eq. 3.39: a peak times the root of 1 - ρ².
+        """
+        inside = (np.arange(64) + 0.5) / 64  # 1 - ρ², of parts of equal area
+        peaks = np.linspace(*self.range_kpa, 64)
+        pressure = peaks[:, None] * np.sqrt(inside)
+        size = np.interp(pressure, self.pressure_kpa, self.magnitude, left=0.0)
+        return PressureCurve(
+            size.mean(axis=1), peaks, np.interp(peaks, self.pressure_kpa, self.sigma_kpa)
+        )
 
     @property
     def range_kpa(self) -> tuple[float, float]:
@@ -170,6 +186,10 @@ class PressureCurve:
         is_bounded = magnitude + ONE_SIDED_95 * sigma <= self.magnitude[-1]
         return np.asarray(is_bounded & (from_onset | (self.pressure_kpa[0] <= 0)))
 
+    def excess(self, magnitude: FloatArray) -> FloatArray:
+        """Pressure in kPa, any shape, by which a peak that falls exceeds an even pressure."""
+        return np.asarray(self.falling._beyond(magnitude) - self.pressure(magnitude))
+
     def _beyond(self, magnitude: FloatArray) -> FloatArray:
         """Pressure with the end pieces prolonged, so that a spread does not shrink at the ends."""
         m, kpa = self.magnitude, self.pressure_kpa
@@ -191,12 +211,14 @@ def pressures_of(
     areas_m2: FloatArray,  # (K,)
     area_sigmas_m2: FloatArray,  # (K,) standard uncertainties; NaN where unknown
     *,
-    # what a fitted field says of them; the magnitudes are even ones if None
+    # what a fitted field says of them; the magnitudes are means if None
     field: FieldContacts | None = None,
     # K ranges of the same contacts a frame ago; none is known if None
     last: Sequence[PressureRange] | None = None,
 ) -> Pressures:
     """Pressures and forces of K contacts from their magnitudes and areas.
+
+    Without a field a magnitude is the mean of its area.
 
     An area taken too large makes the magnitude too small, and the magnitude's uncertainty says so
     already: in the force the two errors partly cancel.
@@ -241,6 +263,10 @@ def pressures_of(
         of_area = (kpa - slope * magnitude) * area_sigmas_m2
         of_pressure = np.hypot(curve.spread(magnitude, apart), own) * areas_m2
         force_sigma = 1e3 * np.hypot(of_pressure, of_area)
+    # Where nobody has told how the pressure falls, it may as a ball's does.
+    may_fall = np.isnan(nothing if field is None else field.edge)
+    of_fall = np.where(may_fall, FALLING_SHARE**0.5 * curve.excess(highest), 0.0)
+    most = np.where(may_fall, curve.falling.bound(highest, up), curve.bound(highest, up))
     is_force = within | (~above & curve.covers(highest, highest_sigma))
     at_least = np.maximum(force - ONE_SIDED_95 * np.nan_to_num(force_sigma), 0.0)
 
@@ -254,6 +280,6 @@ def pressures_of(
         force_sigma_n=told(force_sigma, nothing, is_force),
         ranges=ranges,
         peak_kpa=told(peak, least),
-        peak_sigma_kpa=told(peak_sigma, nothing),
-        max_kpa=np.where(above, np.inf, curve.bound(highest, up)),
+        peak_sigma_kpa=told(np.hypot(peak_sigma, of_fall), nothing),
+        max_kpa=np.where(above, np.inf, most),
     )

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from base64 import b64decode
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -211,6 +212,21 @@ def test_contacts_are_found_where_they_press(
         nearest = min(frame.contacts, key=lambda c: np.hypot(c.x_m - press.x_m, c.y_m - press.y_m))
         assert np.hypot(nearest.x_m - press.x_m, nearest.y_m - press.y_m) < 0.003
         assert nearest.pressure_kpa == pytest.approx(press.pressure_kpa, abs=25)
+
+
+@pytest.mark.parametrize("method", ["network", "tikhonov", "levelset"])
+def test_what_does_not_tell_how_a_pressure_falls_is_unsure_of_its_peak(
+    tared: Tared, skin: Skin, method: str
+) -> None:
+    balls = [
+        replace(press, pressure_kpa=1.4 * press.pressure_kpa, profile="dome") for press in THREE
+    ]
+    frame = tared(method=method, budget_s=1.0).reconstruct(**skin.scan(*balls))
+    assert frame.contacts
+    for contact in frame.contacts:
+        ball = min(balls, key=lambda b: np.hypot(contact.x_m - b.x_m, contact.y_m - b.y_m))
+        assert not abs(contact.peak_kpa - ball.pressure_kpa) > 3 * contact.peak_sigma_kpa
+        assert not contact.max_kpa < ball.pressure_kpa
 
 
 def test_a_missing_structure_scan_leaves_a_map_and_a_missing_magnitude_scan_a_shape(
