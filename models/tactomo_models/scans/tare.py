@@ -34,7 +34,6 @@ from tactomo_models.scans.plausibility import (
 )
 from tactomo_models.scans.polarity import Polarity
 from tactomo_models.scans.reference import Reference, noise_of_reciprocity
-from tactomo_models.scene.parameters import TYPICAL_SIZE
 from tactomo_models.sensor.description import SensorDescription
 
 LEFT_OUT: Final = Flag.ELECTRODE_FAULT | Flag.INVALID_VOLTAGE  # what is known to be missing
@@ -159,10 +158,10 @@ class ChannelTare:
         # place, elongation and size to 0.1 to 0.15 of the square of h / r, relative to r. With this
         # factor the paper's sensor has the least; on an insole (4 mm, 1.8 %) mixed presses have
         # 35 % of their peaks right and 4 % surely wrong with 2 %, 30 and 17 % with 1 %.
-        of_mesh = 0.16
+        of_mesh, typical_m = 0.16, 0.012
         description = self._sensor.description
         spacing_m = description.width_m / (description.map.nodes_x - 1)
-        least = max(least, of_mesh * float(spacing_m / np.exp(TYPICAL_SIZE)) ** 2)
+        least = max(least, of_mesh * (spacing_m / typical_m) ** 2)
         # A model that is wrong about the reference is wrong about the changes, too, if less: most
         # of its error divides out.
         mismatch_share = 1 / 3

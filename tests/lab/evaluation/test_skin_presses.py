@@ -75,7 +75,7 @@ def test_another_pattern_is_refused(skin: SensorDescription, tmp_path: Path) -> 
         ({"dv": np.zeros((4, 190))}, "190"),
         ({"lookup": np.zeros((192, 3), int)}, "lookup"),
         ({"pos_m": np.zeros(4)}, "pos_m"),
-        ({"dv": np.array(["a"])}, "numbers"),
+        ({"dv": np.array(["a"])}, "none that is real"),
     ):
         np.savez(path, **{**good, **change})
         with pytest.raises(DataError, match=told):

@@ -166,7 +166,7 @@ def test_what_is_expected_of_a_certain_image() -> None:
 
 def test_what_is_no_set_of_tanks(tank: SensorDescription, tmp_path: Path) -> None:
     good: dict[str, Any] = {
-        "dv": np.zeros((2, 208)),
+        "dv": np.full((2, 208), -1e-3),
         "truth": np.zeros((2, 16, 16), np.int8),
         "name": np.array(["a", "b"]),
     }
@@ -179,7 +179,7 @@ def test_what_is_no_set_of_tanks(tank: SensorDescription, tmp_path: Path) -> Non
         ({"truth": np.zeros((2, 16))}, "truth"),
         ({"truth": np.zeros((3, 16, 16))}, "truth"),
         ({"name": np.array(["a"])}, "dv is"),
-        ({"dv": np.array([["a"]])}, "numbers"),
+        ({"dv": np.array([["a"]])}, "none that is real"),
     ):
         np.savez(path, **{**good, **change})
         with pytest.raises(DataError, match=told):
