@@ -49,7 +49,7 @@ CELL_SAMPLES = 5  # per side of a map cell, where the truth's coverage is averag
 
 def fine_mesh(description: SensorDescription) -> SheetMesh:
     """Mesh that scenes of a sensor are simulated on; made once, it serves them all."""
-    spacing_m = SPACING_SHARE * description.width_m / (description.map.nodes_x - 1)
+    spacing_m = SPACING_SHARE * description.spacing_m
     return mesh_sheet(description, spacing_m, REFINEMENTS)
 
 

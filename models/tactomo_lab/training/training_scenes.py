@@ -76,7 +76,7 @@ class SceneSimulator:
 
     @cached_property
     def _mesh(self) -> SheetMesh:
-        spacing_m = SPACING_SHARE * self.description.width_m / (self.description.map.nodes_x - 1)
+        spacing_m = SPACING_SHARE * self.description.spacing_m
         return mesh_sheet(self.description, spacing_m, REFINEMENTS)
 
     def simulate(self, scene: TrainingScene) -> dict[str, Any]:

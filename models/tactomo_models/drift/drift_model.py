@@ -75,7 +75,7 @@ class DriftSubspace:
 
     def _smooth_modes(self, description: SensorDescription) -> FloatArray:
         coarse = 2.0  # times the map's spacing: enough for what is smooth
-        spacing_m = coarse * description.width_m / (description.map.nodes_x - 1)
+        spacing_m = coarse * description.spacing_m
         sheet = mesh_sheet(description, spacing_m, refinements=1)
         fields = np.stack(self._smooth_fields(sheet))
         transfer, slopes = transfer_slopes(description, sheet, fields)

@@ -55,7 +55,7 @@ def _spots(forward: ForwardModel) -> tuple[IntArray, FloatArray, FloatArray, Pro
     grid = 2.0  # distance of the spots, in distances of map nodes
     reach = 3.0  # radius over which the field is averaged there, likewise
     description, bare = forward.description, forward.bare
-    spacing = description.width_m / (description.map.nodes_x - 1)
+    spacing = description.spacing_m
     x, y = bare.points[:, bare.pressable]
     cell = np.round(np.stack([x, y]) / (grid * spacing)).astype(int)
     _, chosen = np.unique(cell, axis=1, return_index=True)

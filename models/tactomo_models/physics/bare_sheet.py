@@ -254,7 +254,7 @@ def _map_weights(description: SensorDescription, mesh: skfem.MeshTri) -> sp.csr_
     points = np.stack([x.ravel(), y.ravel()], axis=1)
     # On the chord of an arc, or where the rim is drawn simpler than the outline, the nearest
     # triangle ends short of a point on the sheet; that one's nearest place stands for the point.
-    short_m = MAX_SHORT * description.width_m / (description.map.nodes_x - 1)
+    short_m = MAX_SHORT * description.spacing_m
     corners = mesh.p[:, mesh.t]  # (2, 3, T)
     _, near = cKDTree(corners.mean(axis=1).T).query(points, NEAREST)
     a, b, c = (corners[:, k, near] for k in range(3))  # (2, points, NEAREST)

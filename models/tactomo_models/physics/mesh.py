@@ -108,7 +108,7 @@ def _halves(nodes: IntArray, row: IntArray, column: IntArray) -> IntArray:
 
 def _disc(description: SensorDescription, spacing_m: float | None) -> skfem.MeshTri:
     radius = description.width_m / 2
-    rings = round(radius / (spacing_m or description.width_m / (description.map.nodes_x - 1)))
+    rings = round(radius / (spacing_m or description.spacing_m))
     # The rim's nodes come in equal steps between electrode ends; the rings inside need not know.
     ends = np.sort(np.arctan2(*description.electrode_ends_m.reshape(-1, 2).T[::-1]))
     gaps = np.diff(np.append(ends, ends[0] + 2 * np.pi))

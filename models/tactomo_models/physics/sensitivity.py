@@ -64,7 +64,7 @@ def _signals(
     bare = artifact.bare
     x, y = np.meshgrid(description.map_x_m, description.map_y_m)
     places = np.stack([x.ravel(), y.ravel()], axis=1)
-    mesh_m = description.width_m / (description.map.nodes_x - 1)
+    mesh_m = description.spacing_m
     reach_m = radius_m + mesh_m  # a press between two nodes is a share of both
     near = cKDTree(places).sparse_distance_matrix(
         cKDTree(bare.points[:, bare.pressable].T), reach_m, output_type="coo_matrix"

@@ -159,9 +159,7 @@ class ChannelTare:
         # factor the paper's sensor has the least; on an insole (4 mm, 1.8 %) mixed presses have
         # 35 % of their peaks right and 4 % surely wrong with 2 %, 30 and 17 % with 1 %.
         of_mesh, typical_m = 0.16, 0.012
-        description = self._sensor.description
-        spacing_m = description.width_m / (description.map.nodes_x - 1)
-        least = max(least, of_mesh * (spacing_m / typical_m) ** 2)
+        least = max(least, of_mesh * (self._sensor.description.spacing_m / typical_m) ** 2)
         # A model that is wrong about the reference is wrong about the changes, too, if less: most
         # of its error divides out.
         mismatch_share = 1 / 3

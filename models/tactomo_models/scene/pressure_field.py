@@ -114,7 +114,7 @@ class PressureField:
         least, beyond = 0.01, 3.0
         x, y = np.ascontiguousarray(forward.bare.points[:, forward.bare.pressable])
         description = forward.description
-        spacing = description.width_m / (description.map.nodes_x - 1)
+        spacing = description.spacing_m
         end_kpa = graded.end_kpa if graded else 300.0
         onset = graded.onset_kpa / end_kpa if graded else 0.0
         # Two triangles to a node: half of the sheet is in larger ones, whatever is along its rim.

@@ -213,6 +213,11 @@ class SensorDescription(Section):
         return self.sheet.size_m[1]
 
     @property
+    def spacing_m(self) -> float:
+        """Distance of the map's nodes along x, and about that of the mesh's."""
+        return self.width_m / (self.map.nodes_x - 1)
+
+    @property
     def channels(self) -> tuple[Channel, ...]:
         """The channels this sensor has, magnitude first."""
         both: tuple[Channel, ...] = (Channel.MAGNITUDE, Channel.STRUCTURE)

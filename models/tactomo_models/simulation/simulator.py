@@ -42,7 +42,7 @@ class SkinSimulator:
     ) -> None:
         self.description = description
         #: distance of the nodes
-        self.spacing_m = spacing_m or description.width_m / (description.map.nodes_x - 1) * 2 / 3
+        self.spacing_m = spacing_m or description.spacing_m * 2 / 3
         self._sheet = mesh_sheet(description, self.spacing_m)
         rng = np.random.default_rng(seed)
         x, y = self._sheet.mesh.p
