@@ -19,7 +19,7 @@ from tactomo_models.methods.magnitudes import (
     step,
 )
 from tactomo_models.methods.method import Estimate, Skin, UnsolvableError
-from tactomo_models.methods.trained_networks import load_network
+from tactomo_models.methods.trained_networks import load_network, need_network
 from tactomo_models.physics.artifact import nominal_noise
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.tikhonov import even_scale, tikhonov_matrix
@@ -185,9 +185,9 @@ class _PaperNetworkMethod:
     def check(cls, description: SensorDescription) -> None:
         """Make sure that there is such a network.
 
-        Raises ArtifactError where it is missing or cannot be used.
+        Raises ArtifactError where it is missing.
         """
-        load_network(description, cls.kind, None, SHIPPED)
+        need_network(description, cls.kind, SHIPPED)
 
     def prepare(self, skin: Skin) -> None:
         """Load the network, and make what its images come from."""

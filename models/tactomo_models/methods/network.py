@@ -8,7 +8,7 @@ from typing import Final
 from tactomo_protocol import Channel
 
 from tactomo_models.methods.method import Estimate, Skin
-from tactomo_models.methods.trained_networks import NetworkImage, load_network
+from tactomo_models.methods.trained_networks import FUSION, NetworkImage, need_network
 from tactomo_models.scans.changes import Changes, towards_pressing
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
@@ -25,9 +25,9 @@ class NetworkAlone:
         """Make sure that there is a network.
 
         Raises:
-            ArtifactError: it is missing or cannot be used.
+            ArtifactError: it is missing.
         """
-        load_network(description, "network")
+        need_network(description, FUSION)
 
     def prepare(self, skin: Skin) -> None:
         """Load the network."""

@@ -255,6 +255,26 @@ def own_path(description: SensorDescription, kind: str) -> Path:
     return cache_folder() / f"{description.name}-{description.sha256[:12]}-{kind}.onnx"
 
 
+def need_network(description: SensorDescription, kind: str, shipped: Path = SHIPPED) -> Path:
+    """File of a sensor's network, as `find_network` has it, not yet opened.
+
+    Raises ArtifactError where there is none.
+    """
+    found = find_network(description, kind, shipped)
+    if found is None and len(description.channels) < 2:
+        raise ArtifactError(
+            f"there is no {kind} for sensor {description.name!r}, and there can be none: networks "
+            "need both channels; use auto, or another method"
+        )
+    if found is None:
+        raise ArtifactError(
+            outgrown(description, kind, shipped)
+            or f"there is no {kind} for sensor {description.name!r} ({description.sha256[:12]}); "
+            "train one: tactomo models simulate, then tactomo models train"
+        )
+    return found
+
+
 def load_network(
     description: SensorDescription,
     kind: str,
@@ -272,18 +292,7 @@ def load_network(
     Raises:
         ArtifactError: there is none, or it cannot be used.
     """
-    found = path or find_network(description, kind, shipped)
-    if found is None and len(description.channels) < 2:
-        raise ArtifactError(
-            f"there is no {kind} for sensor {description.name!r}, and there can be none: networks "
-            "need both channels; use auto, or another method"
-        )
-    if found is None:
-        raise ArtifactError(
-            outgrown(description, kind, shipped)
-            or f"there is no {kind} for sensor {description.name!r} ({description.sha256[:12]}); "
-            "train one: tactomo models simulate, then tactomo models train"
-        )
+    found = path or need_network(description, kind, shipped)
     return Network(found, description, kind)
 
 
