@@ -226,6 +226,7 @@ def truth_of(description: SensorDescription, presses: Sequence[Press]) -> Truth:
     along_y, step_y = _cell_samples(description.map_y_m)
     x, y = np.meshgrid(along_x, along_y)
     edge_m = max(step_x, step_y)
+    sample_m2 = step_x * step_y * description.area_factor(x, y)
     pressure, coverage = strongest(presses, x, y, edge_m)
     magnitude = coverage * np.abs(_change(description, pressure))
     contacts = []
@@ -236,9 +237,9 @@ def truth_of(description: SensorDescription, presses: Sequence[Press]) -> Truth:
             TrueContact(
                 x_m=press.x_m,
                 y_m=press.y_m,
-                area_m2=float(own.sum() * step_x * step_y),
+                area_m2=float((own * sample_m2).sum()),
                 pressure_kpa=press.pressure_kpa,
-                magnitude=float(np.average(np.abs(change), weights=own)),
+                magnitude=float(np.average(np.abs(change), weights=own * sample_m2)),
                 shape=press.shape,
             )
         )
@@ -246,7 +247,7 @@ def truth_of(description: SensorDescription, presses: Sequence[Press]) -> Truth:
         map=_over_cells(magnitude),
         pressed=_over_cells(coverage * _saturation(description, pressure)),
         contacts=tuple(contacts),
-        force_n=1e3 * float((coverage * pressure).sum()) * step_x * step_y,
+        force_n=1e3 * float((coverage * pressure * sample_m2).sum()),
     )
 
 

@@ -231,7 +231,7 @@ class SheetEstimator:
     def _by_modes(self, shape: _Shape, first: IntArray, second: IntArray) -> FloatArray:
         """Derivatives (pairs, modes) of transfer resistances by the modes of conductivity."""
         corners = shape.mesh.mesh.t
-        hats, area = hat_gradients(shape.mesh.mesh.p[:, corners])
+        hats, area = hat_gradients(shape.mesh.mesh.p[:, corners], shape.mesh.stretch)
         field = np.einsum("dct,cta->adt", hats, shape.fields[corners])  # (L - 1, 2, T)
         weight = (shape.conductivity * self._modes)[:, corners].mean(axis=1) * area
         products = (field[first] * field[second]).sum(axis=1)

@@ -139,6 +139,8 @@ def save_artifact(artifact: Artifact, path: Path) -> None:
     }
     for name in _BARE_ARRAYS:
         arrays[name] = getattr(artifact.bare, name)
+    if artifact.bare.stretch is not None:
+        arrays["stretch"] = artifact.bare.stretch
     arrays["content_sha256"] = _sha256_of(arrays)
     next_step = "free some space or name another path"
     with os_errors_as(ArtifactError, f"cannot write {path}", next_step):
@@ -201,6 +203,7 @@ def _from_arrays(arrays: dict[str, FloatArray], description: SensorDescription) 
             map_weights=weights,
             green=PackedGreensFunction(arrays["greens"]),
             **{name: arrays[name] for name in _BARE_ARRAYS},  # type: ignore[arg-type]
+            stretch=arrays.get("stretch"),
         ),
         jacobian=arrays["jacobian"],
         tikhonov=arrays["tikhonov"],

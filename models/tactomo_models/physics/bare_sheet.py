@@ -19,7 +19,7 @@ import scipy.sparse.linalg as spla
 import skfem
 from numpy.typing import DTypeLike
 from scipy.spatial import cKDTree
-from skfem.helpers import dot, grad
+from skfem.helpers import dot, grad, mul
 from threadpoolctl import threadpool_limits
 
 from tactomo_models.arrays import FloatArray, IntArray
@@ -51,6 +51,7 @@ class BareSheet:
     map_weights: sp.csr_matrix
     # (N,) of an uneven sheet, relative to the description's; 1 if None
     conductivity: FloatArray | None = None
+    stretch: FloatArray | None = None  # (T, 2, 2) see `SheetMesh`
 
 
 def solve_bare_sheet(
@@ -96,6 +97,7 @@ def solve_bare_sheet(
         transfer=transfer_of(description, fields),
         map_weights=map_weights,
         conductivity=conductivity,
+        stretch=sheet.stretch,
     )
 
 
@@ -186,6 +188,11 @@ def _conduction(u: Any, v: Any, w: Any) -> Any:
     return w["conductivity"] * dot(grad(u), grad(v))
 
 
+@skfem.BilinearForm  # type: ignore[untyped-decorator]
+def _stretched_conduction(u: Any, v: Any, w: Any) -> Any:
+    return dot(mul(w["conductivity"], grad(u)), grad(v))
+
+
 def assemble_sheet(
     description: SensorDescription,  # the sensor
     sheet: SheetMesh,  # its mesh of N nodes and T triangles
@@ -195,6 +202,9 @@ def assemble_sheet(
 ) -> sp.csc_matrix:
     """Assemble the complete electrode model.
 
+    On a surface that stretches the sheet this is the surface's: with the metric g of a triangle, a
+    conductivity of sqrt(det g) / g there, and edges and areas as long and as large as they are.
+
     Returns:
         (N + L - 1, N + L - 1), symmetric positive definite, of the potentials of the nodes and of
         all electrodes but the last.
@@ -202,7 +212,13 @@ def assemble_sheet(
     mesh = sheet.mesh
     nodes, electrodes = mesh.p.shape[1], description.electrode_count
     basis = skfem.Basis(mesh, skfem.ElementTriP1())
-    stiffness = _conduction.assemble(basis, conductivity=conductivity[:, None])
+    if sheet.stretch is None:
+        stiffness = _conduction.assemble(basis, conductivity=conductivity[:, None])
+    else:
+        inverse = np.linalg.inv(sheet.stretch)
+        tensor = (conductivity * np.linalg.det(sheet.stretch))[:, None, None] * (inverse @ inverse)
+        tensor = np.moveaxis(tensor, 0, 2)[..., None]
+        stiffness = _stretched_conduction.assemble(basis, conductivity=tensor)
     # Contact impedance, made relative to the sheet: an extra length of conductor, in metres.
     contact_m = np.full(
         electrodes, description.electrodes.contact_impedance_ohm_m * description.sheet_conductance_s
@@ -213,7 +229,10 @@ def assemble_sheet(
     lengths = np.zeros(electrodes)
     for index, facets in enumerate(sheet.electrode_facets):
         ends = mesh.facets[:, facets]
-        length = np.linalg.norm(mesh.p[:, ends[0]] - mesh.p[:, ends[1]], axis=0)
+        edge = mesh.p[:, ends[0]] - mesh.p[:, ends[1]]
+        if sheet.stretch is not None:
+            edge = np.einsum("fij,jf->if", sheet.stretch[mesh.f2t[0, facets]], edge)
+        length = np.linalg.norm(edge, axis=0)
         lengths[index] = length.sum()
         for i, j in ((0, 0), (1, 1), (0, 1), (1, 0)):
             rows.append(ends[i])
@@ -227,7 +246,8 @@ def assemble_sheet(
     for index, pad, triangles, shares in sheet.pads:
         # It meets the sheet all over; in all as a rim electrode as long as its circumference.
         radius_m = pad.radius_m
-        _, area = hat_gradients(mesh.p[:, mesh.t[:, triangles]])
+        stretch = None if sheet.stretch is None else sheet.stretch[triangles]
+        _, area = hat_gradients(mesh.p[:, mesh.t[:, triangles]], stretch)
         weight = shares * area[:, None, None] * 2 / radius_m / contact_m[index]
         corners = mesh.t[:, triangles].T  # (n, 3)
         rows.append(np.repeat(corners, 3, axis=1).ravel())

@@ -112,7 +112,8 @@ class ForwardModel(CompiledSheet):
         nodes = bare.points.shape[1]
         touched = np.flatnonzero(np.isin(bare.triangles, bare.pressable).any(axis=0))
         corners = bare.triangles[:, touched]  # (3, t)
-        gradient, self._area = hat_gradients(bare.points[:, corners])
+        stretch = None if bare.stretch is None else bare.stretch[touched]
+        gradient, self._area = hat_gradients(bare.points[:, corners], stretch)
         self._corner_support = positions(bare.support, nodes)[corners].T  # (t, 3)
         self._corner_pressable = positions(bare.pressable, nodes)[corners].T  # -1 elsewhere
         self._gradient = np.ascontiguousarray(gradient.transpose(2, 0, 1))  # (t, 2, 3)
@@ -132,15 +133,21 @@ class ForwardModel(CompiledSheet):
         self._triangles_of = _lists(node, triangle, len(self.bare.pressable), fill=triangles)
         self._triangle_count = np.bincount(self._corner_support.ravel(), minlength=nodes)
         ones = np.ones_like(self._stiffness)  # neighbours may have a stiffness of 0 between them
-        row, column = _assembled(ones, self._corner_support, nodes).nonzero()
+        row, column = assembled(ones, self._corner_support, nodes).nonzero()
         self._neighbours = _lists(row, column, nodes, fill=nodes)
-        law = _assembled(
+        law = assembled(
             self._bare_conductivity[:, None, None] * self._stiffness, self._corner_support, nodes
         )
         # Nodes where the bare sheet's currents balance among these triangles. Elsewhere an
         # electrode, or a triangle that cannot be pressed, is part of the balance.
         left = np.abs(law @ self.bare.potentials).max(axis=1)
         self._closed = left < 1e-9 * (abs(law) @ np.abs(self.bare.potentials)).max(axis=1)
+
+    @property
+    def pressable_triangles(self) -> tuple[IntArray, FloatArray]:
+        """Nodes (n, 3) of the triangles whose corners can all be pressed; stiffness (n, 3, 3)."""
+        whole = (self._corner_pressable >= 0).all(axis=1)
+        return self._corner_pressable[whole], self._stiffness[whole]
 
     @property
     def triangle_areas_m2(self) -> FloatArray:
@@ -202,7 +209,7 @@ class ForwardModel(CompiledSheet):
         return self.jacobian(unpressed, np.arange(len(self.bare.pressable)))
 
 
-def _assembled(stiffness: FloatArray, corners: IntArray, nodes: int) -> sp.csr_matrix:
+def assembled(stiffness: FloatArray, corners: IntArray, nodes: int) -> sp.csr_matrix:
     """Sum the (t, 3, 3) of triangles into one matrix on all nodes."""
     rows, columns = np.repeat(corners, 3, axis=1), np.tile(corners, (1, 3))
     return sp.csr_matrix((stiffness.ravel(), (rows.ravel(), columns.ravel())), (nodes, nodes))

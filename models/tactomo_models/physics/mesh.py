@@ -41,6 +41,9 @@ class SheetMesh:
     # per pad, its electrode's number; (n,) triangles that it touches, and (n, 3, 3) integrals of
     # the products of their hat functions over what it covers, of the triangle's area
     pads: tuple[tuple[int, Pad, IntArray, FloatArray], ...] = ()
+    # (T, 2, 2) how a surface stretches each triangle, see `Triangles.stretch_of`; None where none
+    # does
+    stretch: FloatArray | None = None
 
 
 def mesh_sheet(
@@ -275,11 +278,18 @@ def _snap(mesh: skfem.MeshTri, ends: FloatArray) -> skfem.MeshTri:
     return skfem.MeshTri(points, mesh.t)
 
 
-def hat_gradients(corners: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Gradients (2, 3, T) of the hat functions of triangles' corners (2, 3, T), and areas (T,)."""
+def hat_gradients(
+    corners: FloatArray,  # (2, 3, T) of triangles
+    stretch: FloatArray | None = None,  # (T, 2, 2) of a surface that they lie on
+) -> tuple[FloatArray, FloatArray]:
+    """Gradients (2, 3, T) of the hat functions of triangles' corners, and areas (T,)."""
     edge = np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)  # opposite each corner
     twice = edge[0, 1] * edge[1, 2] - edge[1, 1] * edge[0, 2]
-    return np.stack([-edge[1], edge[0]]) / twice, np.abs(twice) / 2
+    gradient, area = np.stack([-edge[1], edge[0]]) / twice, np.abs(twice) / 2
+    if stretch is None:
+        return gradient, area
+    on_surface = np.einsum("tij,jct->ict", np.linalg.inv(stretch), gradient)
+    return on_surface, area * np.linalg.det(stretch)
 
 
 def with_electrodes(mesh: skfem.MeshTri, description: SensorDescription) -> SheetMesh:
@@ -299,7 +309,10 @@ def with_electrodes(mesh: skfem.MeshTri, description: SensorDescription) -> Shee
         # A hair less than half: a facet may begin where the electrode ends.
         on = (rings == electrode.ring) & (off < (1 - 1e-9) * electrode.length_m / 2)
         found.append(facets[on])
-    return SheetMesh(mesh, tuple(found), tuple(pads))
+    stretch = None
+    if description.stretching is not None:
+        stretch = description.stretching.stretch_of(mesh.p[:, mesh.t].transpose(1, 2, 0))
+    return SheetMesh(mesh, tuple(found), tuple(pads), stretch)
 
 
 def part_middles(pieces: int) -> tuple[FloatArray, FloatArray, FloatArray]:

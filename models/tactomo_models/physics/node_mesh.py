@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-import numpy as np
 import scipy.sparse as sp
-import skfem
-from skfem.models.poisson import laplace
 
 from tactomo_models.arrays import FloatArray, IntArray
-from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.physics.forward import ForwardModel, assembled
 
 
 @dataclass(frozen=True)
@@ -28,19 +25,19 @@ class NodeMesh:
     triangles: IntArray
     areas_m2: FloatArray
     electrodes_m: FloatArray
+    _smoothness: sp.csr_matrix = field(repr=False)
 
     @classmethod
     def of(cls, forward: ForwardModel) -> NodeMesh:
         """Take the nodes that can be pressed from a sheet's model."""
         bare = forward.bare
-        number = np.full(bare.points.shape[1], -1, np.intp)
-        number[bare.pressable] = np.arange(len(bare.pressable))
-        triangles = number[bare.triangles.T]
+        triangles, stiffness = forward.pressable_triangles
         return cls(
             nodes_m=bare.points[:, bare.pressable].T,
-            triangles=triangles[(triangles >= 0).all(axis=1)],
+            triangles=triangles,
             areas_m2=forward.node_areas_m2,
             electrodes_m=forward.description.electrode_centres_m,
+            _smoothness=assembled(stiffness, triangles, len(bare.pressable)),
         )
 
     def smoothness(self) -> sp.csr_matrix:
@@ -49,5 +46,4 @@ class NodeMesh:
         K is the stiffness matrix of the Laplace operator with a free rim: symmetric, without a unit
         for relative changes, and 0 for what is constant.
         """
-        mesh = skfem.MeshTri(self.nodes_m.T.copy(), self.triangles.T.copy())
-        return sp.csr_matrix(laplace.assemble(skfem.Basis(mesh, skfem.ElementTriP1())))
+        return self._smoothness

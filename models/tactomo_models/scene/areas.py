@@ -42,8 +42,10 @@ class AreaFinder:
         # (P,) share of the sheet's area that belongs to each
         self.node_areas_m2 = forward.node_areas_m2
         self._x, self._y = np.meshgrid(description.map_x_m, description.map_y_m)
-        self._cell_m2 = (description.map_x_m[1] - description.map_x_m[0]) * (
-            description.map_y_m[1] - description.map_y_m[0]
+        # (nodes_y, nodes_x) of the map's cells
+        self.cells_m2 = description.area_factor(self._x, self._y) * (
+            (description.map_x_m[1] - description.map_x_m[0])
+            * (description.map_y_m[1] - description.map_y_m[0])
         )
         x, y = self.places
         column = np.abs(x[:, None] - description.map_x_m).argmin(axis=1)
@@ -84,7 +86,7 @@ class AreaFinder:
             owner = label[tuple(nearest)]
         mine = owner[None] == np.arange(1, count + 1)[:, None, None]
         on_map = mine * pressed
-        areas = on_map.sum(axis=(1, 2)) * self._cell_m2
+        areas = (on_map * self.cells_m2).sum(axis=(1, 2))
         keep = areas >= smallest_area_m2
         on_map, areas = on_map[keep], areas[keep]
         weight = np.maximum(on_map.sum(axis=(1, 2)), 1e-12)
@@ -97,4 +99,4 @@ class AreaFinder:
     def less(self, areas: Areas, share: FloatArray) -> Areas:
         """The same areas where a share (nodes_y, nodes_x) of each node is left of them."""
         on_map = areas.on_map * share
-        return replace(areas, on_map=on_map, areas_m2=on_map.sum(axis=(1, 2)) * self._cell_m2)
+        return replace(areas, on_map=on_map, areas_m2=(on_map * self.cells_m2).sum(axis=(1, 2)))

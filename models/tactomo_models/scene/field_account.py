@@ -171,8 +171,9 @@ class FieldAccountant:
         _, share, pressure = np.reshape(drawn, (len(kinds), 3, *x.shape)).swapaxes(0, 1)
         magnitude, saturation = self._responses(pressure)
         values = np.stack([share * magnitude, share * saturation, share * pressure])
-        total = np.maximum(share.sum(axis=(1, 2)), 1e-12)
-        by_magnitude, _, by_pressure = values.sum(axis=(2, 3))
+        sample_m2 = self._areas.cells_m2.flat[near] / SAMPLES**2
+        total = np.maximum(share.sum(axis=2) @ sample_m2, 1e-18)
+        by_magnitude, _, by_pressure = values.sum(axis=3) @ sample_m2
         peak = family.unit_kpa * kinds[:, PEAK]
         size = slope = np.zeros(len(kinds))
         if isinstance(self._graded, GradedResponse):
@@ -180,10 +181,10 @@ class FieldAccountant:
         return _Alone(
             near,
             images=values.mean(axis=3),
-            area_m2=total * self._step_m**2,
+            area_m2=total,
             magnitude=by_magnitude / total,
             mean_kpa=by_pressure / total,
-            force_n=1e3 * by_pressure * self._step_m**2,
+            force_n=1e3 * by_pressure,
             peak_kpa=peak,
             peak_magnitude=size,
             slope=slope,

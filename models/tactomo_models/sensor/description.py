@@ -22,6 +22,7 @@ from tactomo_models.sensor.pattern import Pairs, combined, ring_pairs
 from tactomo_models.sensor.response import MagnitudeChannel, StructureChannel
 from tactomo_models.sensor.section import Name, Section, spelt
 from tactomo_models.sensor.sheet import Electrodes, Sheet, check_electrodes, placed_electrodes
+from tactomo_models.sensor.wavefront import Triangles
 
 Electrode = Annotated[int, Field(ge=0, le=63)]
 PairList = Annotated[
@@ -380,12 +381,28 @@ class SensorDescription(Section):
         slack = 1e-9
         return np.asarray(self.sheet.outline.depth(x_m, y_m) >= margin_m - slack)
 
+    @property
+    def stretching(self) -> Triangles | None:
+        """The surface that stretches the sheet; None where it is flat, or bent alone."""
+        surface = self.mount.surface if self.mount else None
+        return surface.triangles if surface and surface.is_stretched else None
+
+    def area_factor(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
+        """Areas on the surface over those on the sheet, at places; of their shape."""
+        if self.stretching is None:
+            return np.ones(np.shape(x_m))
+        places = np.column_stack([np.ravel(x_m), np.ravel(y_m)])
+        covering, _ = self.stretching.covering(places)
+        return np.asarray(self.stretching.stretches[covering].prod(axis=1).reshape(np.shape(x_m)))
+
     @cached_property
     def sha256(self) -> str:
         """Hash of what the physics depends on; calibration tables may change without a rebuild."""
         unlisted = {key for key in ("drive", "measure") if getattr(self.pattern, key) is None}
+        parts = dict.fromkeys(("schema_version", "sheet", "electrodes", "pattern", "map"), True)
+        by_surface = {"mount": {"surface": {"obj": True}}} if self.stretching else {}
         physics = self.model_dump_json(
-            include={"schema_version", "sheet", "electrodes", "pattern", "map"},
+            include={**parts, **by_surface},
             exclude={  # hashes are older than these keys
                 "pattern": unlisted,
                 "sheet": {key for key in ("outline_m", "holes_m") if not getattr(self.sheet, key)},

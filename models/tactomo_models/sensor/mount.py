@@ -2,6 +2,7 @@
 
 A plane, a cylinder or a surface of triangles carries the sheet. A sheet that is bent without being
 stretched conducts as the flat one does: the physics stays the flat sheet's, and the places change.
+On a surface that stretches it, lengths and areas are the surface's.
 Points are metres in the link's frame; the normal points out of the pressed side.
 """
 
@@ -24,9 +25,11 @@ Point = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)
 Quaternion = Annotated[tuple[float, float, float, float], Field(strict=False)]
 
 UNIT_TOLERANCE: Final = 1e-3  # of a unit vector's length: three decimals are enough
-MAX_STRETCH: Final = 0.05
-"""By which a surface may stretch or shrink the sheet; docs/sensor_description.md has what places
-are wrong by there."""
+NEARLY_FLAT: Final = 0.01
+"""By which a surface may stretch or shrink the sheet, and the sheet still counts as bent alone:
+places are then wrong by 0.1 to 0.2 mm."""
+MAX_STRETCH: Final = 2.0
+"""Times by which a surface may stretch or shrink the sheet: the mesh is even on the flat one."""
 CHECKED_PLACES: Final = 500  # of the sheet: as many as take 0.1 s on 2,000 triangles
 MILLIMETRES: Final = 100.0  # lengths so many times too long are in another unit
 
@@ -169,7 +172,7 @@ class SurfaceMount(Section):
         return read_obj(self.obj, self.file or "obj")
 
     def check(self, size_m: tuple[float, float], nodes_m: FloatArray) -> None:
-        """Raise ValueError where the surface is no place for the sheet, or stretches it."""
+        """Raise ValueError where the surface is no place for the sheet, or stretches it too far."""
         name = f"mount.surface {self.file or 'obj'}"
         self._check_units(name, size_m)
         nodes_m = nodes_m[:: max(1, len(nodes_m) // CHECKED_PLACES)]
@@ -189,15 +192,20 @@ class SurfaceMount(Section):
                 f"({x:.1f}, {y:.1f}) mm of the sheet; unwrap the surface without overlap"
             )
         least, most = self.triangles.stretches[covering].T
-        worst = int(np.argmax(np.maximum(most - 1, 1 - least)))
-        if max(most[worst] - 1, 1 - least[worst]) > MAX_STRETCH:
+        worst = int(np.argmax(np.maximum(most, 1 / least)))
+        if max(most[worst], 1 / least[worst]) > MAX_STRETCH:
             x, y = nodes_m[worst] * 1e3
             raise ValueError(
                 f"{name}: at ({x:.1f}, {y:.1f}) mm of the sheet the surface is "
-                f"{least[worst]:.3f} to {most[worst]:.3f} times as long as the sheet; up to "
-                f"{MAX_STRETCH:.0%} is near enough to a bent sheet. Give texture coordinates of "
-                "the sheet's true lengths, or make the sheet of pieces that need no stretching"
+                f"{least[worst]:.3f} to {most[worst]:.3f} times as long as the sheet; "
+                f"{1 / MAX_STRETCH:g} to {MAX_STRETCH:g} can be modelled. Give texture coordinates "
+                "of the sheet's true lengths, or make the sheet of pieces that need less stretching"
             )
+
+    @cached_property
+    def is_stretched(self) -> bool:
+        """Whether lengths on the surface are others than on the sheet."""
+        return bool(np.abs(self.triangles.stretches - 1).max() > NEARLY_FLAT)
 
     def _check_units(self, name: str, size_m: tuple[float, float]) -> None:
         low, high = self.triangles.sheet_extent_m

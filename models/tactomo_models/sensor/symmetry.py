@@ -32,9 +32,10 @@ class Symmetry:
 def symmetries(description: SensorDescription) -> list[Symmetry]:
     """All symmetries of a sensor's sheet, electrodes, pattern and map, the identity first.
 
-    A square sheet has eight, an oblong one four at most.
+    A square sheet has eight, an oblong one four at most; of a stretched one nothing is known.
     """
-    found = (_symmetry(description, matrix) for matrix in _TURNS)
+    turns = _TURNS if description.stretching is None else _TURNS[:1]
+    found = (_symmetry(description, matrix) for matrix in turns)
     return [symmetry for symmetry in found if symmetry is not None]
 
 

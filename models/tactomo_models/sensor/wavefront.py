@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
+import shapely
 
 from tactomo_models.arrays import FloatArray, IntArray
 
@@ -38,6 +39,10 @@ class Triangles:
         stretch = np.einsum("tij,tjk->tik", _edges(self.corners_m), self._to_barycentric)
         return np.asarray(np.linalg.svd(stretch, compute_uv=False)[:, ::-1], float)
 
+    @cached_property
+    def _tree(self) -> shapely.STRtree:
+        return shapely.STRtree(shapely.polygons(self.sheet_m))
+
     @property
     def sheet_extent_m(self) -> tuple[FloatArray, FloatArray]:
         """The lowest and the highest place on the sheet, each (2,)."""
@@ -45,22 +50,37 @@ class Triangles:
 
     def covering(self, xy_m: FloatArray) -> tuple[IntArray, IntArray]:
         """Which triangle is at each place (N,), or is the nearest, and how many are there (N,)."""
-        triangle, count = np.zeros(len(xy_m), np.intp), np.zeros(len(xy_m), np.intp)
-        for row, place in enumerate(xy_m):
-            least = self._barycentric(place).min(axis=1)
-            triangle[row] = least.argmax()
-            count[row] = max((least > ON_EDGE).sum(), (least > -ON_EDGE).any())
-        return triangle, count
+        points = shapely.points(xy_m)
+        triangle = np.asarray(self._tree.nearest(points), np.intp)
+        near_m = ON_EDGE * float(np.linalg.norm(_edges(self.sheet_m), axis=1).max())
+        place, found = self._tree.query(points, "dwithin", near_m)
+        least = self._barycentric(xy_m[place], found).min(axis=1)
+        deepest_last = np.argsort(least)
+        triangle[place[deepest_last]] = found[deepest_last]
+        inside, near = (
+            np.bincount(place[least > depth], minlength=len(xy_m)) for depth in (ON_EDGE, -ON_EDGE)
+        )
+        return triangle, np.maximum(inside, near > 0)
 
     def place(self, xy_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Points and normals, each (N, 3), of places (N, 2) on the sheet."""
         triangle, _ = self.covering(xy_m)
-        weights = np.array(
-            [self._barycentric(place)[which] for place, which in zip(xy_m, triangle, strict=True)]
-        ).reshape(-1, 3)
+        weights = self._barycentric(xy_m, triangle)
         points = np.einsum("nk,nkd->nd", weights, self.corners_m[triangle])
         normals = np.einsum("nk,nkd->nd", weights, self.normals[triangle])
         return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+    def stretch_of(self, corners_m: FloatArray) -> FloatArray:
+        """How the surface stretches triangles of corners (3, n, 2) on the sheet: (n, 2, 2).
+
+        The symmetric root of the metric: what is this times a vector on the sheet is as long as
+        that vector is on the surface.
+        """
+        lifted = self.place(corners_m.reshape(-1, 2))[0].reshape(3, -1, 3)
+        across = np.linalg.inv(_edges(corners_m.swapaxes(0, 1)))
+        slope = _edges(lifted.swapaxes(0, 1)) @ across  # (n, 3, 2)
+        squares, axes = np.linalg.eigh(slope.swapaxes(1, 2) @ slope)
+        return np.asarray((axes * np.sqrt(squares)[:, None]) @ axes.swapaxes(1, 2))
 
     def unplace(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Places on the sheet (N, 2) below points (N, 3), and how far above it those are (N,)."""
@@ -76,9 +96,10 @@ class Triangles:
             heights[row] = (point - foot[nearest]) @ (weights[nearest] @ self.normals[nearest])
         return places, heights
 
-    def _barycentric(self, place: FloatArray) -> FloatArray:
-        """A place's coordinates in each triangle, (T, 3)."""
-        two = np.einsum("tij,tj->ti", self._to_barycentric, place - self.sheet_m[:, 0])
+    def _barycentric(self, xy_m: FloatArray, triangle: IntArray) -> FloatArray:
+        """Coordinates (N, 3) of places (N, 2), each in a triangle of its own."""
+        off = xy_m - self.sheet_m[triangle, 0]
+        two = np.einsum("nij,nj->ni", self._to_barycentric[triangle], off)
         return np.column_stack([1 - two.sum(axis=1), two])
 
 

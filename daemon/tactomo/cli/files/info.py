@@ -112,6 +112,16 @@ def _array_facts(path: Path) -> dict[str, Any]:
     return {"kind": kind, "bytes": path.stat().st_size, **facts, "arrays": shapes}
 
 
+def _mount_in_words(description: SensorDescription) -> str:
+    mount = description.mount
+    assert mount is not None
+    words = f"{mount.kind} on {mount.frame}"
+    if description.stretching is None:
+        return words
+    lengths = description.stretching.stretches
+    return f"{words}, {lengths.min():.2f} to {lengths.max():.2f} times the sheet's lengths"
+
+
 def _description_facts(description: SensorDescription) -> dict[str, Any]:
     width_mm, height_mm = description.width_m * 1e3, description.height_m * 1e3
     magnitude = description.magnitude
@@ -120,7 +130,7 @@ def _description_facts(description: SensorDescription) -> dict[str, Any]:
         "title": description.title,
         "sheet": f"{description.sheet.shape}, {width_mm:g} x {height_mm:g} mm",
         "electrodes": description.electrode_count,
-        **({"mount": f"{mount.kind} on {mount.frame}"} if (mount := description.mount) else {}),
+        **({"mount": _mount_in_words(description)} if description.mount else {}),
         **({"companions": ", ".join(description.companion)} if description.companion else {}),
         "voltages a scan": description.measurements,
         "pattern": str(description.pattern),
