@@ -399,6 +399,9 @@ def test_outlines_colours_and_verdicts_are_computed_right(page: Page) -> None:
         np.testing.assert_allclose(np.reshape(table, (256, 3)), expected, atol=9)
     # A replay that goes on is not stale before its next frame.
     assert page.module(VERDICTS, "health.js") == [None, "stale"]
+    # A page whose first frame has not come yet only waits: red is for failures.
+    verdicts = [None, ["no-frame", "info"], ["no-frame", "error"]]
+    assert page.module(FIRST_FRAME, "health.js") == verdicts
     # A move is over with its own frame, whether that comes before the reply or after it.
     is_before = page.browser.execute_async_script("""
         const done = arguments[0];
@@ -436,6 +439,17 @@ VERDICTS = """
       frame: { age_ms: 26_000, receivedAt: 1e6 },
       stoodAt: 1e6 - ms,
     }, 1e6)?.name)"""
+
+
+FIRST_FRAME = """
+    [100, 2000, 20_000].map((ms) => m.verdict({
+      link: { isOpen: true },
+      hello: { status_stale_ms: 5000, frame_stale_ms: 500 },
+      status: { age_ms: 0, receivedAt: 1e6, fields: { state: 'running' } },
+      frame: null,
+      openedAt: 1e6 - ms,
+      stoodAt: -Infinity,
+    }, 1e6)).map((found) => found && [found.name, found.level])"""
 
 
 CONTRAST = """
@@ -1138,6 +1152,24 @@ def test_what_stops_is_told_and_comes_back(page: Page) -> None:
         wait_until(lambda: page.health == "good")
         wait_until(partial(is_bright, page, -36, 30))
         wait_until(page["tare"].is_enabled)
+
+
+def test_a_server_given_up_for_its_silence_is_asked_again_once(page: Page) -> None:
+    page.open()
+    # The socket that is given up closes a little later, while the next one is waited for.
+    sockets = page.browser.execute_async_script("""
+        const done = arguments[0], made = [];
+        window.WebSocket = class {
+          constructor() { made.push(this); }
+          close() { setTimeout(() => this.onclose(), 50); }
+        };
+        import('/link.js').then(({ Link }) => {
+          const link = new Link({ onChange() {} });
+          made[0].onopen();
+          link.lastHeard = -Infinity;
+          setTimeout(() => done(made.length), 2200);
+        })""")
+    assert sockets == 2
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import { seconds } from "./values.js";
 
 const STALE_SCANS = 3;        // of a slow sensor: so many scans late
+const BRIEFLY_MS = 1500;      // what a page that opens waits for without a word
 const SLOW_START_MS = 20_000; // a daemon that builds its models tells nothing meanwhile
 const SOON_S = 10;            // after its start a daemon may wait for its ports and for data
 
@@ -34,14 +35,14 @@ export function isMapCurrent(found) {
  */
 export function verdict(state, now) {
   const { link, frame, status, hello } = state;
+  const waited = now - state.openedAt;
   if (!link.isOpen) {
-    if (!hello && now < 1500) return null;
+    if (!hello && now < BRIEFLY_MS) return null;
     return banner("viewer-gone", "error", "The viewer's server is gone.",
       "The page tries again; if you stopped the server, start it with `tactomo viewer`.");
   }
   if (!status) {
-    const waited = now - state.openedAt;
-    if (waited < 1500) return null;
+    if (waited < BRIEFLY_MS) return null;
     if (waited < SLOW_START_MS) {
       return banner("starting", "info", `Waiting for “${hello?.sensor ?? "?"}”.`,
         "A daemon that starts for the first time builds the sensor's models, which takes up to a minute.");
@@ -72,9 +73,13 @@ export function verdict(state, now) {
     return banner("replay-paused", "info", "The replay is paused.", "The map shows the frame at the slider"
       + (fields.replay.maps_before ? ", solved without those before: pressures may differ from the recorded ones." : "."));
   }
+  if (!frame) {
+    if (waited < BRIEFLY_MS) return null;
+    return banner("no-frame", waited < 1000 * SOON_S ? "info" : "error", "No frame yet.", wrong);
+  }
   const age = Math.min(ageOf(frame, now), now - state.stoodAt);
   if (age > staleAfter(fields, hello)) {
-    const since = frame ? `The newest frame is ${seconds(age)} old` : "";
+    const since = `The newest frame is ${seconds(age)} old`;
     return banner("stale", "error", "Stale.", [since, wrong].filter(Boolean).join("; "));
   }
   const [issue] = errors;

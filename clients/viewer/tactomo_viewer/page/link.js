@@ -14,7 +14,7 @@ export class Link {
     this.#open();
     setInterval(() => this.#check(), 1000);
     // A page that was left may be kept, asleep, for the way back: it must let go of the skin.
-    addEventListener("pagehide", () => this.socket.close());
+    addEventListener("pagehide", () => this.socket?.close());
   }
 
   /** Send something without asking for an answer; false when it cannot be sent. */
@@ -65,6 +65,7 @@ export class Link {
 
   #closed(socket) {
     if (socket !== this.socket) return;
+    this.socket = null;  // one that was given up for its silence may close once more
     this.isOpen = false;
     for (const resolve of this.waiting.values()) resolve(gone());
     this.waiting.clear();
@@ -75,8 +76,9 @@ export class Link {
   // A server that hangs, or a computer that left the network, never closes the connection.
   #check() {
     if (this.isOpen && performance.now() - this.lastHeard > SILENT_MS) {
-      this.socket.close();
-      this.#closed(this.socket);
+      const { socket } = this;
+      this.#closed(socket);
+      socket.close();
     }
   }
 }

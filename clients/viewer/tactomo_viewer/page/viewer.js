@@ -269,7 +269,7 @@ function refresh() {
   showBanner(found);
   state.isCurrent = past?.isKnown ?? isMapCurrent(found);
   for (const id of ["map", "surface"]) byId(id).classList.toggle("stale", !state.isCurrent);
-  document.body.dataset.health = found?.name ?? (state.status ? "good" : "connecting");
+  document.body.dataset.health = found?.name ?? (state.status && state.frame ? "good" : "connecting");
   const linked = isHeard(state, now);
   if (linked) showState(["stale", "ended"].includes(live?.name) ? live.name : state.status.fields.state);
   else if (live?.level === "error") showState("gone", "disconnected");
