@@ -1121,6 +1121,9 @@ def test_what_stops_is_told_and_comes_back(page: Page) -> None:
     closed = {"severity": "error", "what": "/dev/ttySKIN is closed", "next_step": "plug it in"}
     page.skin.status |= {"issues": [closed]}
     wait_until(lambda: page.banner.endswith(" s old; /dev/ttySKIN is closed"))
+    stopped = {"severity": "error", "what": "scans have stopped", "next_step": "see the ports"}
+    page.skin.status |= {"issues": [stopped, closed, stopped]}
+    wait_until(lambda: page.banner.endswith(" old; /dev/ttySKIN is closed; 2 more under Channels"))
     page.skin.status |= {"issues": []}
     page.skin.sends_frames = True
     wait_until(lambda: page.health == "good")

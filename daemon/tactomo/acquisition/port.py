@@ -427,7 +427,7 @@ class PortReader(Worker):
         """Return in words what is the matter with a device in this state; empty if nothing is."""
         hello = self.hello
         if state is DeviceState.SILENT:
-            return f"nothing came for {self._liveness.silence_s:.3g} s"
+            return f"nothing came for {self._liveness.silence_s:.3g} s or longer"
         if state is DeviceState.GARBAGE:
             return (
                 f"bytes come, but no packet of protocol {self.protocol.name} at {self._baud} baud"

@@ -59,7 +59,7 @@ export function verdict(state, now) {
     return banner("taring", "info", "Taring.", "Measuring the unloaded skin: do not touch it.");
   }
   const errors = (fields.issues ?? []).filter(({ severity }) => severity === "error");
-  const wrong = errors.map(({ what }) => what).join("; ");
+  const wrong = worst(errors, fields.ports ?? []);
   if (fields.state.startsWith("waiting")) {
     return banner("no-data", fields.uptime_s < SOON_S ? "info" : "warning", "No data yet:", wrong);
   }
@@ -84,6 +84,13 @@ export function verdict(state, now) {
   }
   const [issue] = errors;
   return issue ? banner("issue", "warning", `${issue.what}:`, issue.next_step) : null;
+}
+
+// What fits into a banner: a port's trouble, which is the cause of what else is told, and how much else.
+function worst(errors, ports) {
+  if (!errors.length) return "";
+  const cause = errors.find(({ what }) => ports.some(({ url }) => what.startsWith(url))) ?? errors[0];
+  return cause.what + (errors.length > 1 ? `; ${errors.length - 1} more under Channels` : "");
 }
 
 /** Whether the daemon's status comes. */

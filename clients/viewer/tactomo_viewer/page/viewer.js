@@ -130,6 +130,7 @@ async function showMount(mount) {
   view.resize();
   if (!mount) return;
   const turn = "drag beside the sheet to turn it, or use the arrow keys";
+  setText(byId("surface-help"), `${mount.frame}: loading the surface`);
   try {
     const { SurfaceView } = await import("./surface_view.js");
     if (!surface) {
