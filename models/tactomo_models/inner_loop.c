@@ -692,7 +692,7 @@ int evaluate_slopes(const Sheet *s, const Areas *a, const Response *response, co
 
 /* Contacts: the columns of their parameters, and constants, as in `scene.pressure_field`. */
 enum { X, Y, SIZE, E1, E2, HARMONIC, PEAK = 9, EDGE, HOLE, COLUMNS };
-static const double UNIT_M = 0.01, NOWHERE = 1e-6, GRADED_WIDTH = 0.7, RIM = 0.1;
+static const double UNIT_M = 0.01, NOWHERE = 1e-2, GRADED_WIDTH = 0.7, RIM = 0.1;
 static const double MOST_BLURRED = 0.4;
 static const double PI = 3.14159265358979323846;
 

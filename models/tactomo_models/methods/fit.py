@@ -143,41 +143,108 @@ class Fit:
     ) -> tuple[Course, Measurement]:
         """The same as `_followed`, without the companions that contradict the sheets.
 
-        Companions are fitted beside the sheets first. Now and then, and where that does not explain
-        all data, the sheets are fitted alone, from a cold start; the frame may take as long again.
+        Those that do not are fitted beside the sheets. Now and then, and where not all data are
+        explained, the sheets are asked alone, from a cold start; the frame may take as long again.
         """
         companions = measurement.companions
-        if not companions:
-            return self._followed(course, measurement, Budget(budget_s))
-        disputed = {
-            name: before
-            for name, before in course.disputed.items()
-            if name in companions and _stays(before, companions[name], course.belief)
-        }
-        kept = {name: one for name, one in companions.items() if name not in disputed}
+        disputed = {k: one for k, one in course.disputed.items() if k in companions}
+        trusted = {k: one for k, one in companions.items() if k not in disputed}
         fitted, judged = self._followed(
-            course, replace(measurement, companions=kept), Budget(budget_s)
+            course, replace(measurement, companions=trusted), Budget(budget_s)
         )
         assert fitted.belief is not None
-        felt = self._forces(fitted.belief, kept)
-        is_doubtful = not fitted.belief.is_explained or _is_new(fitted.belief)
-        is_doubtful |= not all(one.agrees_with(felt[name][0]) for name, one in kept.items())
-        believed = course.believed & kept.keys()
-        if kept and fitted.belief.done and (is_doubtful or kept.keys() - believed):
-            alone, sheets = self._followed(
-                Course(drifts=course.drifts), replace(measurement, companions={}), Budget(budget_s)
+        if fitted.belief.how != "still":
+            disputed = {k: companions[k] for k in disputed}
+        fitted = replace(fitted, believed=course.believed & trusted.keys(), disputed=disputed)
+        if self._are_doubtful(fitted, trusted):
+            return self._questioned(fitted, judged, measurement, trusted, budget_s)
+        again = self._agreeing_again(fitted, companions)
+        if again:
+            return self._trusted_again(fitted, judged, measurement, again, budget_s)
+        return fitted, judged
+
+    def _are_doubtful(self, fitted: Course, trusted: Mapping[str, CompanionForce]) -> bool:
+        """Whether the sheets are to be asked about the companions that were fitted beside them."""
+        belief = fitted.belief
+        assert belief is not None
+        if not trusted or not (belief.done or not belief.is_explained):
+            return False
+        if not belief.is_explained or _is_new(belief) or trusted.keys() - fitted.believed:
+            return True
+        felt = self._forces(belief, trusted)
+        return not all(one.agrees_with(felt[name][0]) for name, one in trusted.items())
+
+    def _questioned(
+        self,
+        fitted: Course,
+        judged: Measurement,
+        measurement: Measurement,
+        trusted: Mapping[str, CompanionForce],
+        budget_s: float,
+    ) -> tuple[Course, Measurement]:
+        """The course without the companions that the sheets alone contradict."""
+        alone, sheets = self._followed(
+            Course(drifts=fitted.drifts), replace(measurement, companions={}), Budget(budget_s)
+        )
+        assert fitted.belief is not None
+        assert alone.belief is not None
+        if not (alone.belief.is_explained or alone.belief.done):
+            return fitted, judged
+        told = self._forces(alone.belief, trusted)
+        wrong = {k: one for k, one in trusted.items() if not one.agrees_with(*told[k])}
+        if not wrong and fitted.belief.done and _are_unlikely(trusted, fitted.belief, alone.belief):
+            wrong = dict(trusted)
+        believed = frozenset(trusted.keys() - wrong.keys())
+        if not wrong:
+            return replace(fitted, believed=believed), judged
+        return replace(alone, believed=believed, disputed={**fitted.disputed, **wrong}), sheets
+
+    def _agreeing_again(
+        self, fitted: Course, companions: Mapping[str, CompanionForce]
+    ) -> dict[str, CompanionForce]:
+        """Disputed companions that the sheets no longer contradict; rarely while nothing is new."""
+        belief = fitted.belief
+        assert belief is not None
+        if not fitted.disputed or not belief.done:
+            return {}
+        now = {name: companions[name] for name in fitted.disputed}
+        told = self._forces(belief, now)
+        return {
+            name: one
+            for name, one in now.items()
+            if one.agrees_with(*told[name])
+            and (_is_new(belief) or _has_changed(belief, fitted.disputed[name], one))
+        }
+
+    def _trusted_again(
+        self,
+        fitted: Course,
+        judged: Measurement,
+        measurement: Measurement,
+        again: Mapping[str, CompanionForce],
+        budget_s: float,
+    ) -> tuple[Course, Measurement]:
+        """The course with companions that were disputed, where the sheets bear them out."""
+        companions = measurement.companions
+        assert fitted.belief is not None
+        if fitted.belief.how == "still":  # fitted to another frame, whose noise is another
+            trusted = {k: companions[k] for k in fitted.believed}
+            anew, judged = self._followed(
+                Course(drifts=fitted.drifts),
+                replace(measurement, companions=trusted),
+                Budget(budget_s),
             )
-            assert alone.belief is not None
-            told = self._forces(alone.belief, kept)
-            wrong = {k: one for k, one in kept.items() if not one.agrees_with(*told[k])}
-            if not wrong and _are_unlikely(kept, fitted.belief, alone.belief):
-                wrong = kept
-            believed = frozenset(kept.keys() - wrong.keys())
-            if wrong:
-                fitted, judged, disputed = alone, sheets, disputed | wrong
-        else:  # whoever was disputed stays so until the sheets are asked
-            disputed |= {k: one for k, one in course.disputed.items() if k in kept}
-        return replace(fitted, believed=believed, disputed=disputed), judged
+            fitted = replace(anew, believed=fitted.believed, disputed=fitted.disputed)
+        kept = {k: companions[k] for k in fitted.believed | again.keys()}
+        beside, beside_judged = self._followed(
+            fitted, replace(measurement, companions=kept), Budget(budget_s)
+        )
+        assert fitted.belief is not None
+        assert beside.belief is not None
+        if not beside.belief.is_explained or _are_unlikely(again, beside.belief, fitted.belief):
+            return fitted, judged
+        disputed = {k: one for k, one in fitted.disputed.items() if k not in again}
+        return replace(beside, believed=frozenset(kept), disputed=disputed), beside_judged
 
     def _forces(
         self, belief: Belief, companions: Mapping[str, CompanionForce]
@@ -312,11 +379,9 @@ def _is_new(belief: Belief | None) -> bool:
     return belief is None or (belief.how != "still" and not belief.frames & (belief.frames - 1))
 
 
-def _stays(before: CompanionForce, now: CompanionForce, belief: Belief | None) -> bool:
-    """Whether a disputed companion stays left out, as long as nothing is new."""
-    if belief is None or _is_new(belief):
-        return False
-    return belief.how != "still" or now.agrees_with(before.force_n, before.sigma_n)
+def _has_changed(belief: Belief, before: CompanionForce, now: CompanionForce) -> bool:
+    """Whether a companion reads something else than when it was disputed, of the same scene."""
+    return belief.how == "still" and not now.agrees_with(before.force_n, before.sigma_n)
 
 
 def _are_unlikely(companions: Mapping[str, CompanionForce], beside: Belief, alone: Belief) -> bool:

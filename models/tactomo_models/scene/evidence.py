@@ -32,6 +32,7 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.scans.changes import Changes
 from tactomo_models.scans.companion_forces import SheetsAndCompanions
 
+ROUNDING = 1e-12  # of a Hessian's diagonal: where one parameter stands for another, it is no less
 FALSE_ALARM = 1e-3  # chance that data which an account explains are taken for unexplained
 
 
@@ -86,5 +87,7 @@ class Likelihood:
 
 def log_occam(precision: FloatArray, hessian: FloatArray) -> float:
     """Logarithm of the share of its prior range (N,) that the data leave of each parameter."""
-    root = np.linalg.cholesky(hessian)
-    return float(np.log(precision).sum() / 2 - np.log(np.diag(root)).sum())
+    scale = np.sqrt(np.diag(hessian))
+    of_unit = hessian / np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
+    root = scale * np.diag(np.linalg.cholesky(of_unit))
+    return float(np.log(precision).sum() / 2 - np.log(root).sum())

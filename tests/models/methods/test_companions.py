@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,9 @@ from tactomo_models import (
 )
 from tactomo_models.arrays import FloatArray
 from tactomo_models.batch import reconstruct_file
+from tactomo_models.methods.account import Frame
 from tactomo_models.methods.method import Skin as Prepared
-from tactomo_models.methods.search import Search
+from tactomo_models.methods.search import Belief, Search
 from tactomo_models.scans.companion_forces import CompanionReading, SheetsAndCompanions
 from tactomo_models.scene.field_fit import FieldFit
 from tactomo_models.scene.parameters import COLUMNS, EDGE, PEAK, SIZE, X
@@ -87,6 +89,36 @@ def test_a_load_cell_that_contradicts_the_sheet_is_named_and_left_out(
     assert wrong.force_n == pytest.approx(alone.force_n, rel=1e-6)
     again = reconstructor.reconstruct(scan, None, companions=[("load_cell", BALL_N / 2 + 5)])
     assert not again.flags & Flag.COMPANION_DISPUTED  # it is believed once it agrees
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_load_cell_that_is_wrong_costs_a_moving_scene_nothing(
+    sensor: SensorDescription, skin: Skin, monkeypatch: pytest.MonkeyPatch, factor: float
+) -> None:
+    """Once it is left out, frames are those of the sheet alone, and as quick."""
+    advanced: list[bool] = []
+    advance = Search.advance
+
+    def counted(self: Search, belief: Belief | None, frame: Frame) -> Belief:
+        advanced.append(belief is None)
+        return advance(self, belief, frame)
+
+    monkeypatch.setattr(Search, "advance", counted)
+    places = np.linspace(-0.02, 0.02, 12)
+    presses = [replace(BALL, x_m=x) for x in places]
+    scans, reference = [skin.scan(press)["magnitude"] for press in presses], skin.reference()
+    forces = []
+    for wrong in (False, True):
+        made = Reconstructor(sensor)
+        made.set_reference(reference)
+        advanced.clear()
+        cell = [("load_cell", factor * BALL_N / 2 + 5)] if wrong else None
+        frames = [made.reconstruct(scan, None, companions=cell) for scan in scans]
+        forces.append([frame.force_n for frame in frames])
+        assert all(frame.tier == "fit" for frame in frames)
+    assert all(Flag.COMPANION_DISPUTED in frame.flags for frame in frames)
+    assert forces[1] == pytest.approx(forces[0], rel=1e-9)
+    assert len(advanced) == len(scans) + 1
 
 
 @pytest.mark.parametrize(("factor", "is_believed"), [(0.6, False), (1.0, True), (2.0, False)])

@@ -116,3 +116,14 @@ def test_noise_of_the_size_that_was_told_is_explained() -> None:
     missed = np.mean([not likelihood.explains(float(each)) for each in chi_squared])
     assert missed == pytest.approx(FALSE_ALARM, abs=4 * np.sqrt(FALSE_ALARM / 20000))
     assert not likelihood.explains(200 + 6 * np.sqrt(2 * 200))
+
+
+def test_parameters_that_stand_for_one_another_have_an_evidence() -> None:
+    """Rounding may leave such a Hessian a negative eigenvalue."""
+    precision = np.array([0.04, 0.04, 2.8])
+    along = np.array([1.0, 1.0, 1e-3])
+    hessian = 4e17 * np.outer(along, along) + np.diag(precision)
+    assert np.isfinite(log_occam(precision, hessian))
+    hessian[0, 1] = hessian[1, 0] = hessian[0, 0] + 64  # its last digit
+    assert np.linalg.eigvalsh(hessian)[0] < 0
+    assert np.isfinite(log_occam(precision, hessian))

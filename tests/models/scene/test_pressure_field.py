@@ -60,6 +60,18 @@ def field(forward: ForwardModel, small: SensorDescription) -> PressureField:
     return PressureField.on(forward, GradedResponse.of(small.magnitude.response))
 
 
+def test_slopes_stay_small_where_a_node_is_in_the_middle_of_a_small_contact(
+    field: PressureField,
+) -> None:
+    """There an outline's distance has no direction: slopes were a million times as large."""
+    at = int(np.hypot(field.x_m, field.y_m).argmin())
+    for off_m in (0.0, 1e-12, 1e-9, 1e-6, 1e-4):
+        each = contacts(contact(field.x_m[at] + off_m, field.y_m[at], 0.003, e=(0.5, 0.3)))
+        family = field.of(each)
+        drawing = family.draw(family.join(each))
+        assert max(np.abs(slope).max() for slope in drawing.slopes()[::2]) < 1000
+
+
 def on_nodes(drawing: Drawing, count: int, unit_kpa: float) -> FloatArray:
     """What each sheet sees pressed, and the pressure on that in the field's unit: (4, P)."""
     values = np.zeros((4, count))
