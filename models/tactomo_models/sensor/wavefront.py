@@ -36,8 +36,12 @@ class Triangles:
     @cached_property
     def stretches(self) -> FloatArray:
         """How many times as long as on the sheet each triangle is: (T, 2), least and most."""
-        stretch = np.einsum("tij,tjk->tik", _edges(self.corners_m), self._to_barycentric)
-        return np.asarray(np.linalg.svd(stretch, compute_uv=False)[:, ::-1], float)
+        return np.asarray(np.linalg.svd(self._slopes, compute_uv=False)[:, ::-1], float)
+
+    @cached_property
+    def _slopes(self) -> FloatArray:
+        """(T, 3, 2): by how much a point moves with its place on the sheet."""
+        return _edges(self.corners_m) @ self._to_barycentric
 
     @cached_property
     def _tree(self) -> shapely.STRtree:
@@ -70,16 +74,15 @@ class Triangles:
         normals = np.einsum("nk,nkd->nd", weights, self.normals[triangle])
         return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
-    def stretch_of(self, corners_m: FloatArray) -> FloatArray:
-        """How the surface stretches triangles of corners (3, n, 2) on the sheet: (n, 2, 2).
+    def stretch_of(self, xy_m: FloatArray) -> FloatArray:
+        """How the surface stretches n pieces of the sheet, by k places (n, k, 2) on each: (n, 2, 2).
 
-        The symmetric root of the metric: what is this times a vector on the sheet is as long as
-        that vector is on the surface.
+        The symmetric root of the mean metric there: what is this times a vector on the sheet is as
+        long as that vector is on the surface.
         """
-        lifted = self.place(corners_m.reshape(-1, 2))[0].reshape(3, -1, 3)
-        across = np.linalg.inv(_edges(corners_m.swapaxes(0, 1)))
-        slope = _edges(lifted.swapaxes(0, 1)) @ across  # (n, 3, 2)
-        squares, axes = np.linalg.eigh(slope.swapaxes(1, 2) @ slope)
+        triangle, _ = self.covering(xy_m.reshape(-1, 2))
+        slope = self._slopes[triangle].reshape(*xy_m.shape[:2], 3, 2)
+        squares, axes = np.linalg.eigh((slope.swapaxes(2, 3) @ slope).mean(axis=1))
         return np.asarray((axes * np.sqrt(squares)[:, None]) @ axes.swapaxes(1, 2))
 
     def unplace(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:

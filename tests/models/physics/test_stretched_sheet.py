@@ -86,6 +86,13 @@ def test_a_sheet_stretched_along_one_side_is_the_longer_sheet(small: SensorDescr
     assert transfer_resistances(small, sheet, even) == pytest.approx(expected, rel=1e-9)
 
 
+def test_a_fold_stretches_nothing(small: SensorDescription) -> None:
+    """A triangle of the mesh that lies across it is no shorter than the surface."""
+    folded = on_surface(small, lambda x, y: (1.2 * abs(x), y, 0.0))
+    expected = resistances(on_surface(small, along(1.2, 1.0)))
+    assert resistances(folded) == pytest.approx(expected, rel=1e-9)
+
+
 @pytest.fixture(scope="module")
 def ball(small: SensorDescription) -> SensorDescription:
     return on_surface(small, on_ball, cells=60)
