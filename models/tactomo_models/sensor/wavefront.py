@@ -75,7 +75,7 @@ class Triangles:
         return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
     def stretch_of(self, xy_m: FloatArray) -> FloatArray:
-        """How the surface stretches n pieces of the sheet, by k places (n, k, 2) on each: (n, 2, 2).
+        """How a surface stretches n pieces of the sheet, by k places (n, k, 2) on each: (n, 2, 2).
 
         The symmetric root of the mean metric there: what is this times a vector on the sheet is as
         long as that vector is on the surface.
