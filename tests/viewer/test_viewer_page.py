@@ -1118,6 +1118,7 @@ def test_what_stops_is_told_and_comes_back(page: Page) -> None:
     assert page["state"].text == "stale"
     wait_until(lambda: page.map_classes == {"pressable", "stale"})
     wait_until(lambda: page["no-contacts"].text == "Not known.")  # and not "Nothing pressed."
+    assert page["made-by"].text == "–"
     closed = {"severity": "error", "what": "/dev/ttySKIN is closed", "next_step": "plug it in"}
     page.skin.status |= {"issues": [closed]}
     wait_until(lambda: page.banner.endswith(" s old; /dev/ttySKIN is closed"))

@@ -67,8 +67,8 @@ export function showQuality(frame, trusted) {
   const { misfit, confidence } = trusted ? frame : { misfit: null, confidence: null };
   setText(byId("misfit"), misfit === null ? "–" : `${fixed(misfit, 1)} σ`);
   setText(byId("confidence"), confidence === null ? "–" : `${fixed(100 * confidence, 0)} %`);
-  setText(byId("made-by"), frame.tier ?? "–");
-  setText(byId("made-by-reason"), frame.tier_reason ?? "");
+  setText(byId("made-by"), (trusted && frame.tier) || "–");
+  setText(byId("made-by-reason"), (trusted && frame.tier_reason) || "");
   const list = byId("quality");
   const isLinear = LINEAR.includes(frame.tier);
   const key = trusted ? `${isLinear} ${frame.flags}` : "not known";
