@@ -1203,6 +1203,9 @@ def test_at_every_width_all_is_seen_and_nothing_moves_when_a_banner_comes(page: 
     firm = replace(contact, pressure_sigma_kpa=11.0, force_n=128.0, force_sigma_n=13.0)
     light = replace(firm, id=2, pressure_kpa=None, pressure_range="below", max_kpa=131.0)
     page.skin.contacts = [firm, light]
+    error = """const error = document.getElementById('error');
+        error.textContent = 'error 2.0 mm, −16 kPa';
+        const {scrollWidth, clientWidth} = error;"""
     table = "const {scrollWidth, clientWidth} = document.querySelector('.scroll');"
     places = """return ['map', 'strip', 'moment'].map((id) => {
         const {left, top, width, height} = document.getElementById(id).getBoundingClientRect();
@@ -1216,6 +1219,7 @@ def test_at_every_width_all_is_seen_and_nothing_moves_when_a_banner_comes(page: 
         wait_until(lambda: "131" in page["contacts"].text)
         assert page.js("return document.documentElement.scrollWidth") <= width
         assert page.js(f"{table} return scrollWidth - clientWidth") == 0  # nothing is cut off
+        assert page.js(f"{error} return scrollWidth - clientWidth") == 0
         left, right = (
             page.js("return tactomo.mmToPixel(arguments[0], 0)[0]", x) for x in (-75, 75)
         )
