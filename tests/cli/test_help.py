@@ -271,13 +271,33 @@ def test_a_path_or_address_that_cannot_be_is_told(tactomo: Run, words: list[str]
     assert re.search("name too long|it is no text", result.stderr), result.stderr[-300:]
 
 
-def test_what_cannot_be_written_to_is_told() -> None:
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("options", [["--json"], []])
+def test_what_cannot_be_written_to_is_told(options: list[str], unbuffered: str) -> None:
     """A disk that the output was directed to is full."""
-    program = [sys.executable, "-m", "tactomo.cli", "info", GOLDEN, "--json"]
+    program = [sys.executable, "-m", "tactomo.cli", "info", GOLDEN, *options]
     with Path("/dev/full").open("wb") as full:
-        result = subprocess.run(program, stdout=full, stderr=subprocess.PIPE, check=False)
+        result = subprocess.run(
+            program,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            check=False,
+            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+        )
     assert (result.returncode, b"Traceback" in result.stderr) == (1, False), result.stderr
-    assert b"No space left" in result.stderr
+    assert re.fullmatch(b"tactomo: cannot .*: No space left .*\n", result.stderr)
+
+
+def test_who_reads_no_further_is_told_nothing() -> None:
+    program = [sys.executable, "-m", "tactomo.cli", "info", GOLDEN]
+    environment = {**os.environ, "PYTHONUNBUFFERED": ""}
+    with subprocess.Popen(
+        program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
 
 
 def test_the_default_addresses_are_the_clients() -> None:

@@ -6,6 +6,8 @@ needs it, so that `tactomo --help` and `tactomo status` answer at once.
 
 from __future__ import annotations
 
+import errno
+import os
 import sys
 import traceback
 
@@ -21,11 +23,25 @@ def main() -> None:
     """Run the command line; exits with 0 (good), 1 (failure), 2 (usage) or 130 (Ctrl-C)."""
     watch_parent()
     try:
-        app(prog_name="tactomo")
+        try:
+            app(prog_name="tactomo")
+        finally:
+            _flush()
     except Exception as error:
         words = explain(error)
         _print_error(error if words is None else f"tactomo: {words}")
         sys.exit(1)
+
+
+def _flush() -> None:
+    """Write what was printed, while a failure can still be told; no more is tried at the exit."""
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if error.errno != errno.EPIPE:  # who reads no further knows why
+            raise
 
 
 def _print_error(what: Exception | str) -> None:
