@@ -271,13 +271,13 @@ static double green_at(const Sheet *s, int64_t row, int64_t column) {
   return s->green_single ? s->green_single[place] : s->green_double[place];
 }
 
-/* Columns (size, count) of a symmetric matrix whose lower triangle is given in either precision;
+/* A block (rows, count) of a symmetric matrix whose lower triangle is given in either precision;
  * row by row, so that every part of it is read once. */
-void columns_of(const float *singles, const double *doubles, int64_t size, int64_t count,
-                const int64_t *column, double *found) {
-  for (int64_t i = 0; i < size; i++)
+void block_of(const float *singles, const double *doubles, int64_t rows, const int64_t *row,
+              int64_t count, const int64_t *column, double *found) {
+  for (int64_t i = 0; i < rows; i++)
     for (int64_t k = 0; k < count; k++) {
-      int64_t place = in_triangle(i, column[k]);
+      int64_t place = in_triangle(row[i], column[k]);
       found[i * count + k] = singles ? singles[place] : doubles[place];
     }
 }

@@ -36,7 +36,7 @@ _ARGUMENTS = {
         _COUNT,
         *[_ARRAY] * 3,
     ],
-    "columns_of": [_ARRAY, _ARRAY, _COUNT, _COUNT, _ARRAY, _ARRAY],
+    "block_of": [_ARRAY, _ARRAY, _COUNT, _ARRAY, _COUNT, _ARRAY, _ARRAY],
     "conduct": [_ARRAY, _COUNT, _ARRAY, _ARRAY, ctypes.c_double, _ARRAY, _ARRAY],
     "draw": [_ARRAY, _COUNT, _ARRAY, _COUNT, *[_ARRAY] * 7],
     "draw_slopes": [_ARRAY, _COUNT, _ARRAY, _COUNT, *[_ARRAY] * 3, _COUNT, *[_ARRAY] * 4],
@@ -78,7 +78,7 @@ def _functions(path: Path) -> dict[str, Any]:
     for name, function in functions.items():
         function.argtypes = _ARGUMENTS[name]
     functions["draw"].restype = _COUNT
-    functions["conduct"].restype = functions["columns_of"].restype = None
+    functions["conduct"].restype = functions["block_of"].restype = None
     return functions
 
 

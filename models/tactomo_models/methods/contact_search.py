@@ -53,14 +53,13 @@ class MissingContact:
 def _spots(forward: ForwardModel) -> tuple[IntArray, FloatArray, FloatArray, Probes]:
     """The spots that are looked at: their nodes, places (N,) in metres, and probes there."""
     grid = 2.0  # distance of the spots, in distances of map nodes
-    reach = 3.0  # radius over which the field is averaged there, likewise
     description, bare = forward.description, forward.bare
     spacing = description.spacing_m
     x, y = bare.points[:, bare.pressable]
     cell = np.round(np.stack([x, y]) / (grid * spacing)).astype(int)
     _, chosen = np.unique(cell, axis=1, return_index=True)
     nodes = np.sort(chosen)
-    return nodes, x[nodes], y[nodes], forward.probes(x[nodes], y[nodes], reach * spacing)
+    return nodes, x[nodes], y[nodes], forward.probes(nodes)
 
 
 class ContactSearch:

@@ -27,6 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 import shapely
+from scipy.spatial import Delaunay
 
 from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.physics.bare_sheet import BareSheet, scan_voltages, volts_per_unit
@@ -35,15 +36,14 @@ from tactomo_models.physics.mesh import hat_gradients
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.sheet import Ring
 
-_STRIP = 256  # spots at once: what that takes stays in the cache
-
 
 @dataclass(frozen=True)
 class Probes:
     """Where the field is looked at: C spots, each an average over its neighbourhood."""
 
+    nodes: IntArray  # (C,) of the support nodes
     bare: FloatArray  # (2 C, L - 1) field of the bare sheet there, x components first
-    gradient: sp.csr_matrix  # (2 C, S) of potentials at the support nodes, averaged
+    gradient: sp.csr_matrix  # (2 C, C) of potentials at these nodes, averaged
 
 
 class ForwardModel(CompiledSheet):
@@ -167,28 +167,27 @@ class ForwardModel(CompiledSheet):
         x, y = self.bare.points[:, self.bare.pressable]
         return np.asarray(of_each * shapely.intersects_xy(shapely.Polygon(region_m), x, y))
 
-    def probes(self, x_m: FloatArray, y_m: FloatArray, radius_m: float) -> Probes:
-        """Prepare to look at the field around C points, each weighted by a cone of that radius."""
-        corners = self.bare.points[:, self.bare.support[self._corner_support]]  # (2, t, 3)
-        middle_x, middle_y = corners.mean(axis=2)
-        strips = []
-        for start in range(0, len(x_m), _STRIP):
-            strip = slice(start, start + _STRIP), None
-            distance = np.hypot(x_m[strip] - middle_x, y_m[strip] - middle_y)
-            strips.append(sp.csr_matrix(np.clip(1 - distance / radius_m, 0, None) * self._area))
-        weight = sp.vstack(strips)
-        weight = sp.diags(1 / weight.sum(axis=1).A1) @ weight
-        triangles, nodes = len(self._area), len(self.bare.support)
-        rows = np.repeat(np.arange(triangles), 3)
-        by_axis = [
-            sp.csr_matrix(
-                (self._gradient[:, axis].ravel(), (rows, self._corner_support.ravel())),
-                (triangles, nodes),
-            )
-            for axis in (0, 1)
-        ]
-        mean = sp.vstack([weight @ gradient for gradient in by_axis]).tocsr()
-        return Probes(mean @ self.bare.potentials, mean)
+    def probes(self, spots: IntArray) -> Probes:
+        """Prepare to look at the field at C of the pressable nodes, by differences between them."""
+        description, places = self.description, self.bare.points[:, self.bare.pressable[spots]]
+        corners = Delaunay(places.T).simplices  # (T, 3)
+        middle = places[:, corners].mean(axis=2)
+        corners = corners[description.on_sheet(*middle)]  # none across a notch or a hole
+        stretch = None
+        if description.stretching is not None:
+            stretch = description.stretching.stretch_of(middle.T[:, None])
+        gradient, area = hat_gradients(places[:, corners.T], stretch)
+        triangle, spot, count = np.arange(len(corners)), corners.ravel(), len(spots)
+        of_each = np.repeat(area, 3), (spot, np.repeat(triangle, 3))
+        share = sp.csr_matrix(of_each, (count, len(corners)))
+        share = sp.diags(1 / np.maximum(share.sum(axis=1).A1, 1e-30)) @ share
+        slopes = (
+            sp.csr_matrix((each.T.ravel(), (np.repeat(triangle, 3), spot)), (len(corners), count))
+            for each in gradient
+        )
+        mean = sp.vstack([share @ slope for slope in slopes]).tocsr()
+        nodes = positions(self.bare.support, self.bare.points.shape[1])[self.bare.pressable[spots]]
+        return Probes(nodes, mean @ self.bare.potentials[nodes], mean)
 
     def spot_sensitivity(self, probes: Probes, solution: Solution) -> FloatArray:
         """Derivative (M, C) of the voltages by the conductivity of one square metre at each spot.
@@ -196,7 +195,7 @@ class ForwardModel(CompiledSheet):
         Unlike `jacobian` it looks anywhere, at the price of resolution: it is for finding where a
         contact is missing in a solution, not for fitting it.
         """
-        moved = self.bare.green.columns(solution.rim) @ solution.injected
+        moved = self.bare.green.between(probes.nodes, solution.rim) @ solution.injected
         field = self._pair_matrix @ (probes.bare + probes.gradient @ moved).T
         x, y = np.split(field, 2, axis=1)  # (pairs, C) each
         one, other = self._products

@@ -26,9 +26,7 @@ from tactomo_models.inner_loop import LIBRARY, at
 
 
 class PackedGreensFunction:
-    """The whole function in half its memory: it is symmetric.
-
-    A block of it is a look-up: for one contact 5 us more than in all of it.
+    """The whole function in half its memory: it is symmetric, and a block of it is a look-up.
 
     Args:
         lower: (S (S + 1) / 2,) potentials at nodes for unit currents into others, row by row, each
@@ -37,26 +35,23 @@ class PackedGreensFunction:
 
     def __init__(self, lower: NDArray[Any]) -> None:
         self.lower = lower
-        place = np.arange(isqrt(2 * len(lower)))
-        self._start = place * (place + 1) // 2  # of each row
+        self._size = isqrt(2 * len(lower))
 
     def between(self, rows: IntArray, columns: IntArray) -> FloatArray:
         """Potentials (r, c) at some of the nodes for unit currents into others, by their places."""
-        row = rows[:, None]
-        lower, upper = self._start[row] + columns, self._start[columns] + row
-        found = self.lower.take(np.where(row >= columns, lower, upper))
-        return np.asarray(found, np.float64)
-
-    def columns(self, columns: IntArray) -> FloatArray:
-        """Potentials (S, c) at all nodes for unit currents into some."""
-        found = np.empty((len(self._start), len(columns)))
+        found = np.empty((len(rows), len(columns)))
         by_precision = (
             at(self.lower if self.lower.dtype == dtype else None)
             for dtype in (np.float32, np.float64)
         )
-        columns = np.ascontiguousarray(columns, np.int64)
-        LIBRARY.columns_of(*by_precision, *found.shape, at(columns), at(found))
+        rows, columns = (np.ascontiguousarray(each, np.int64) for each in (rows, columns))
+        of_block = len(rows), at(rows), len(columns), at(columns)
+        LIBRARY.block_of(*by_precision, *of_block, at(found))
         return found
+
+    def columns(self, columns: IntArray) -> FloatArray:
+        """Potentials (S, c) at all nodes for unit currents into some."""
+        return self.between(np.arange(self._size), columns)
 
 
 class GreensFunction:
