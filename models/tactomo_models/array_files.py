@@ -22,6 +22,8 @@ from tactomo_models.foreign_file import open_regular
 Arrays = dict[str, NDArray[Any]]
 
 NUMBERS: Final = "numbers"  # the one array of a file that names none
+MAX_SIZE: Final = 1e30  # of any number, in any unit: what is larger overflows in the work
+_DOUBLE: Final = 8  # bytes; smaller numbers cannot be as large, or not once they are doubles
 _SMALL_BYTES: Final = 64 << 20
 _PACKED: Final = 16
 _MOST_ARRAYS: Final = 4096
@@ -68,6 +70,21 @@ def check_unpacked(path: Path, size: int, arrays: int) -> None:
             f"{path} claims {arrays} arrays of {size / 1e6:.0f} MB in all; of a file of its size, "
             f"{_MOST_ARRAYS} of {most / 1e6:.0f} MB are read: save it anew, uncompressed"
         )
+
+
+def bounded(array: NDArray[Any]) -> NDArray[Any]:
+    """Return numbers of which those beyond `MAX_SIZE` are infinite; complex ones are NaN.
+
+    No instrument reads such, and their squares overflow.
+    """
+    if array.dtype.kind not in "fc" or array.dtype.itemsize < _DOUBLE:
+        return array
+    parts = (array.real, array.imag) if array.dtype.kind == "c" else (array,)
+    ends = [f.reduce(part, axis=None, initial=0.0) for part in parts for f in (np.fmin, np.fmax)]
+    if max(np.abs(ends)) <= MAX_SIZE:  # without a copy
+        return array
+    beyond = np.logical_or.reduce([np.abs(part) > MAX_SIZE for part in parts])
+    return np.where(beyond, np.nan if len(parts) > 1 else np.copysign(np.inf, array), array)
 
 
 def read_text(path: Path) -> Arrays:

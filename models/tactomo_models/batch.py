@@ -14,6 +14,7 @@ from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
 from tactomo_models.archive import read_arrays, write_whole
+from tactomo_models.array_files import bounded
 from tactomo_models.arrays import FloatArray
 from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_models.errors import CalibrationError, DataError
@@ -308,7 +309,10 @@ def all_nan(array: Any) -> bool:
 
 
 def checked(source: Path, name: str, array: Any, shape: tuple[int | None, ...]) -> FloatArray:
-    """Return real numbers of a shape, of any length where None; DataError where they are not."""
+    """Return real numbers of a shape, of any length where None; infinite beyond `MAX_SIZE`.
+
+    Raises DataError where they are not.
+    """
     if array.ndim == 2 and len(shape) == 1 and 1 in array.shape:
         array = array.ravel()  # MATLAB has no vectors
     fits = array.ndim == len(shape) and all(
@@ -321,7 +325,7 @@ def checked(source: Path, name: str, array: Any, shape: tuple[int | None, ...]) 
             f"{source}: {name} is {array.dtype} of shape {array.shape}; real numbers of shape "
             f"{wanted}{several} are needed"
         )
-    return np.asarray(array, dtype=np.float64)
+    return np.asarray(bounded(array), dtype=np.float64)
 
 
 def _frame_row(frame: Reconstruction) -> dict[str, Any]:

@@ -35,6 +35,8 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
             "FILE",
         ),
         "presses": ("evaluate", "presses", "FILE", "--train", "10"),
+        "ktc": ("evaluate", "ktc", "FILE"),
+        "measured": ("evaluate", "measured", "FILE"),
         "load_cell": ("calibrate", "fit", "FILE", "--recording", "GOOD.npz"),
         "robot": ("export", "GOOD.mcap", "OUT", "--lerobot", "--robot", "FILE"),
     },
@@ -140,6 +142,7 @@ def read_by(command: str, path: Path, good: Path, folder: Path) -> Ended:
         *(places.get(word, str(out / word) if word.startswith("OUT") else word) for word in line),
     )
     assert "Traceback" not in ended.said, ended.said
+    assert "Warning" not in ended.said, ended.said
     assert ended.status in (0, 1, 2), ended
     assert ended.peak_mb < MAX_MB, ended
     assert ended.cpu_s < MAX_CPU_S, ended

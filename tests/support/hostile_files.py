@@ -22,6 +22,7 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 from tactomo.recordings.recording import Origin
 from tactomo.recordings.recording_writer import RecordingWriter, port_entry
+from tactomo_models import SkinSimulator, load_description
 from tactomo_models.sensor.description_file import shipped_text
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag, encode
 
@@ -73,6 +74,51 @@ def markup_npz(path: Path) -> None:
         allow_pickle=False,
         **{ESCAPES.replace("/", "|"): np.zeros(3), "skin[left]": np.zeros((2, 208))},
     )
+
+
+def _tanks(path: Path, injection: int, weights: int, side: int) -> None:
+    """A tank of the challenge's, by as many injections, weights and pixels a side."""
+    rows = {"injection": (1, 32, injection), "measurement": (32, weights)}
+    readings = dict.fromkeys(("reference", "voltages"), (1, injection * weights))
+    arrays = {name: np.ones(shape, np.int8) for name, shape in {**rows, **readings}.items()}
+    truth = np.zeros((1, side, side), np.int8)
+    np.savez_compressed(path, allow_pickle=False, truth=truth, **arrays)
+
+
+def large_pictures_npz(path: Path) -> None:
+    """A tank in a picture of 36 million pixels, whose score would take 4 GB."""
+    _tanks(path, 76, 31, 6000)
+
+
+def many_readings_npz(path: Path) -> None:
+    """A tank of a million readings, of which each has 64 numbers of electrodes."""
+    _tanks(path, 1000, 1000, 4)
+
+
+def beyond_npz(path: Path) -> None:
+    """Voltages whose squares no computer holds, among honest ones."""
+    [volts] = SkinSimulator(load_description("tank_disc")).voltages([]).values()
+    scans = volts * (1 + 1e-4 * np.random.default_rng(0).normal(size=(6, len(volts))))
+    rest = scans.copy()
+    scans[::2], rest[0, 3] = 1e308, -1e308
+    np.savez(path, structure=scans, structure_reference=rest)
+
+
+def beyond_recording(path: Path) -> None:
+    """Scans of the largest numbers on the wire, each of the largest scale."""
+    largest = float(np.finfo(np.float32).max)
+    both = (Channel.MAGNITUDE, Channel.STRUCTURE)
+    kind = SampleFormat.FLOAT32
+    hello = Hello("device", "firmware", both, 16, 1, 1, 208, kind, largest, 20.0)
+    writer = RecordingWriter(path, Origin("skin", "paper_square", "", ("a",), "0"))
+    writer.add(port_entry(0, encode(hello), 10**10, 10**10))
+    for counter in range(1, 60):
+        at_ns = 10**10 + 50_000_000 * counter
+        for channel in both:
+            samples = np.full(208, largest * (-1) ** counter, np.float32)
+            scan = Scan(channel, counter, 50_000 * counter, ScanFlag(0), samples)
+            writer.add(port_entry(0, encode(scan), at_ns, at_ns))
+    writer.close()
 
 
 def zeros_mat(path: Path, megabytes: int = 700) -> None:
@@ -298,12 +344,16 @@ CORPUS: Final[dict[str, Callable[[Path], None]]] = {
     "boastful.npz": boastful_npz,
     "members.npz": many_members_npz,
     "markup.npz": markup_npz,
+    "pictures.npz": large_pictures_npz,
+    "readings.npz": many_readings_npz,
+    "beyond.npz": beyond_npz,
     "zeros.mat": zeros_mat,
     "wide.csv": wide_csv,
     "tall.csv": tall_csv,
     "headless.csv": headless_csv,
     "markup.mcap": markup_recording,
     "devices.mcap": many_devices,
+    "beyond.mcap": beyond_recording,
     "timeless.mcap": timeless_recording,
     "password.mcap": password_recording,
     "piped.mcap": piped_recording,

@@ -16,6 +16,7 @@ from collections.abc import Callable, Collection
 from typing import Final
 
 from tactomo_models import SensorDescription
+from tactomo_models.array_files import bounded
 from tactomo_models.arrays import FloatArray
 from tactomo_protocol import (
     Acknowledge,
@@ -308,7 +309,10 @@ class PortReader(Worker):
             if _is_refusal(packet):
                 name = packet.status.name
                 self._tell(
-                    "command_refused", f"the device answered command {packet.command} with {name}"
+                    "command_refused",
+                    f"the device answered command {packet.command} with {name}",
+                    "if scans come as they should, nothing; else switch the device off and on, and "
+                    "see that its firmware takes what firmware_protocol/PROTOCOL.md requires",
                 )
         elif isinstance(packet, Scan):
             self._asked_s = time.monotonic()
@@ -319,7 +323,7 @@ class PortReader(Worker):
                 if fault:
                     self._note_fault(fault, now_s)
                 elif packet.channel in self._description.channels:
-                    return packet.volts(hello.volts_per_count)
+                    return bounded(packet.volts(hello.volts_per_count))
             self.unused += 1
         elif isinstance(packet, CompanionReading) and self._is_known and not self.refusal:
             self._take_reading(packet)

@@ -18,6 +18,7 @@ from tactomo_models.calibration.calibration_file import data_folder
 
 from tactomo.errors import RecordingError
 from tactomo.events import OnEvent
+from tactomo.protocols.interface import TWIN_ID
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import REFERENCE_ARRAYS
 from tactomo.timing import wall_clock_ns
@@ -82,7 +83,9 @@ class KeptReference:
             sha256, *before = self._about([str(each) for each in arrays["device_ids"]])
             if str(arrays["description_sha256"]) != sha256:
                 return None
-            if new := sorted(set(device_ids) - set(before)):
+            new = sorted(set(device_ids) - set(before))
+            # Twins have no cables, and another name where a description of the same sheet has.
+            if new and not all(each.startswith(TWIN_ID) for each in (*before, *new)):
                 self._on_event(
                     "device_changed",
                     f"at the start, {', '.join(new)} instead of {', '.join(before)}",

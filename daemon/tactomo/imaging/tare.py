@@ -235,6 +235,8 @@ class _Scans:
             if len(volts) >= self._wanted
         }
         for channel, stack in stacks.items():
+            if not np.isfinite(stack).all():
+                break  # which `Reference` refuses
             movement, noise = movement_and_noise(stack)
             if movement > max(noise, MOVEMENT_LIMIT):
                 raise CommandError(

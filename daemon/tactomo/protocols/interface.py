@@ -57,6 +57,10 @@ def check_scan_fits(description: SensorDescription) -> None:
         )
 
 
+TWIN_ID: Final = "twin-"
+"""What the id of a simulated device begins with; its description's name follows."""
+
+
 def hello_of(
     description: SensorDescription,
     channels: tuple[Channel, ...],

@@ -35,6 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tactomo_models import Reference, SensorDescription
 from tactomo_models.archive import read_arrays
+from tactomo_models.array_files import bounded
 from tactomo_models.arrays import FloatArray
 from tactomo_models.batch import all_nan, checked, companions_of, scans_of
 from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
@@ -216,6 +217,8 @@ def _turned_round(scans: Scans, description: SensorDescription) -> Scans:
 def load_arrays(path: Path | Sequence[Path]) -> dict[str, NDArray[Any]]:
     """Return the arrays of a file by name, or those that .eit files or a folder of them amount to.
 
+    Numbers that no instrument reads are none, see `bounded`.
+
     Raises ImportFileError or EitFileError where it cannot be read, DataError without numbers.
     """
     given = [path] if isinstance(path, Path) else path
@@ -229,7 +232,7 @@ def load_arrays(path: Path | Sequence[Path]) -> dict[str, NDArray[Any]]:
     [one] = files
     step = f"give the path of a file such as .npz, {SUFFIX}, .mat or .csv"
     with os_errors_as(ImportFileError, f"cannot read {one}", step):
-        return read_arrays(one)
+        return {name: bounded(array) for name, array in read_arrays(one).items()}
 
 
 def is_single_ended(arrays: Mapping[str, Any]) -> bool:
@@ -265,7 +268,8 @@ def _differences(
     injection, raw = _single_ended_arrays(path, arrays, description)
     rows, signs = _injection_rows(path, injection - injection.min(), description)
     plus, minus = description.pairs.measure.T
-    differences = signs * (raw[:, rows, plus] - raw[:, rows, minus])
+    with np.errstate(invalid="ignore"):  # of two infinite readings
+        differences = signs * (raw[:, rows, plus] - raw[:, rows, minus])
     return differences, _times(path, arrays, len(raw))
 
 

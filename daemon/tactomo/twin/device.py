@@ -33,7 +33,7 @@ from tactomo.endpoint import is_local
 from tactomo.errors import CommandError, ConfigError
 from tactomo.plain import counted
 from tactomo.protocols import NATIVE, check_scan_fits, emulator_of, find_protocol
-from tactomo.protocols.interface import hello_of
+from tactomo.protocols.interface import TWIN_ID, hello_of
 from tactomo.stream.commands import Nothing, explained
 from tactomo.twin.companions import SimulatedCompanions
 from tactomo.twin.control import (
@@ -294,7 +294,7 @@ class Twin:
         hello = hello_of(
             config.description,
             config.description.channels,
-            f"twin-{f'{protocol}-' if is_foreign else ''}{device}"[:64],
+            f"{TWIN_ID}{f'{protocol}-' if is_foreign else ''}{device}"[:64],
             f"tactomo-twin {version('tactomo')}",
             config.rate_hz,
             SampleFormat.INT32,

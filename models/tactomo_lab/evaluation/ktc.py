@@ -20,7 +20,7 @@ from tactomo_models.arrays import BoolArray, FloatArray, Image, IntArray
 from tactomo_models.errors import DataError
 from tactomo_models.sensor.description import SensorDescription
 
-from tactomo_lab.evaluation.measured_sets import read_set
+from tactomo_lab.evaluation.measured_sets import check_pictures, read_set
 from tactomo_lab.tanks.fit import TankFit
 from tactomo_lab.tanks.images import pixel_grid
 from tactomo_lab.tanks.model import Readings, TankModel
@@ -28,6 +28,7 @@ from tactomo_lab.tanks.model import Readings, TankModel
 WATER_SIGMA = 0.05  # of the scale's logarithm; four measured empty tanks leave the model 0.04 off
 WINDOW = 80  # pixels, standard deviation of the score's window; it ends at twice that
 C1, C2 = 1e-4, 9e-4
+MAX_READINGS = 4096  # of a tank, as of the largest pattern; the challenge's are 2356
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,7 @@ def read_challenge(path: Path, description: SensorDescription) -> Challenge:
     keys = ("injection", "measurement", "reference", "voltages", "truth")
     arrays = read_set(path, "the challenge's tanks", *keys)
     currents, weights, reference, voltages, truth = (arrays[key] for key in keys)
+    check_pictures(path, truth)
     level = arrays.get("level", np.zeros(len(truth)))
     tanks, electrodes = len(truth), description.electrode_count
     readings = currents.shape[-1] * weights.shape[-1]
@@ -78,12 +80,13 @@ def read_challenge(path: Path, description: SensorDescription) -> Challenge:
         "measurement": (weights, (electrodes, weights.shape[-1])),
         "reference": (reference, (tanks, readings)),
         "voltages": (voltages, (tanks, readings)),
-        "truth": (truth, (tanks, *truth.shape[-2:])),
         "level": (level, (tanks,)),
     }
     for key, (array, wanted) in shapes.items():
         if array.shape != wanted:
             raise DataError(f"{path}: {key} is {array.shape}; {wanted} is needed, drive by drive")
+    if readings > MAX_READINGS:
+        raise DataError(f"{path}: {readings} readings of a tank; at most {MAX_READINGS} are read")
     if not np.isin(truth, (0, 1, 2)).all():
         raise DataError(f"{path}: truth holds other values than 0 water, 1 worse, 2 better")
     if not np.isin(level, range(8)).all():

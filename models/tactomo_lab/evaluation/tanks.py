@@ -30,7 +30,7 @@ from tactomo_models.scans.reference import Reference, noise_of_reciprocity
 from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.sensor.description import SensorDescription
 
-from tactomo_lab.evaluation.measured_sets import read_set
+from tactomo_lab.evaluation.measured_sets import check_pictures, read_set
 from tactomo_lab.scenes.measures import correlation
 from tactomo_lab.tanks.fit import TankFit
 from tactomo_lab.tanks.images import pixel_grid, probabilities, signed_image
@@ -81,9 +81,10 @@ def read_tanks(path: Path, description: SensorDescription) -> Tanks:
     """
     arrays = read_set(path, "tanks", "dv", "truth")
     changes, truth = arrays["dv"], arrays["truth"]
+    check_pictures(path, truth)
     names = np.atleast_1d(arrays.get("name", np.arange(len(truth))))
     wanted = (len(names), description.measurements)
-    if changes.shape != wanted or truth.ndim != 3 or len(truth) != len(names):
+    if changes.shape != wanted or len(truth) != len(names):
         raise DataError(
             f"{path}: dv is {changes.shape}, truth is {truth.shape}; {wanted} and "
             f"({len(names)}, rows, columns) are needed"

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
+from scipy.spatial.distance import cdist
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scene.drawing import heaviside, heaviside_slope
 
@@ -68,8 +69,7 @@ class TankFit:
         self._empty = readings.by_pair @ model.empty
 
     def _gaussians(self, points: FloatArray) -> FloatArray:
-        off = points[:, None] - self._centres
-        return np.asarray(np.exp(-(off**2).sum(axis=2) / (2 * WIDTH**2)))
+        return np.asarray(np.exp(cdist(points, self._centres, "sqeuclidean") / (-2 * WIDTH**2)))
 
     def find(
         self,
@@ -142,8 +142,8 @@ class TankFit:
         0.5 or more in objects that conduct better, -0.5 or less in those that conduct worse.
         """
         axis = np.linspace(-1, 1, 2 * PIXELS + 1)
-        grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-        f = (self._gaussians(grid) @ tank.coefficients).reshape(len(axis), -1)
+        across, up = np.exp((axis[:, None] - self._centres.T[:, None]) ** 2 / (-2 * WIDTH**2))
+        f = (up * tank.coefficients) @ across.T
         x, y, _ = pixel_grid(rows, columns)
         return np.asarray(RegularGridInterpolator((axis, axis), f)((y, x)))
 

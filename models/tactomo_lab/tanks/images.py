@@ -18,6 +18,7 @@ from importlib import resources
 import numpy as np
 import onnxruntime as ort
 from scipy.interpolate import RegularGridInterpolator
+from scipy.spatial.distance import cdist
 from tactomo_models.arrays import BoolArray, FloatArray
 
 from tactomo_lab.tanks.model import Readings, TankModel
@@ -69,16 +70,17 @@ class LinearImages:
         share = step / width / np.sqrt(np.pi)  # for a variance of 1
 
         def gaussians(points: FloatArray) -> FloatArray:
-            off = points[:, None] - centres
-            return np.asarray(share * np.exp(-(off**2).sum(axis=2) / (2 * width**2)))
+            squares = cdist(points, centres, "sqeuclidean")
+            return np.asarray(share * np.exp(squares / (-2 * width**2)))
 
         jacobian = model.derivative(readings.by_pair) @ model.nodes @ gaussians(model.points)
         size, axes = np.linalg.eigh(jacobian @ jacobian.T)
         seen = gaussians(np.stack([x, y], axis=-1)[self.inside])
         back = seen @ jacobian.T @ axes
         shrinks = [prior / (prior * size + 1) for prior in PRIORS]
-        self._images = np.concatenate([(back * shrink) @ axes.T for shrink in shrinks])
-        self._images = self._images.astype(np.float32)
+        self._images = np.concatenate(
+            [((back * shrink) @ axes.T).astype(np.float32) for shrink in shrinks]
+        )
         known = (back**2 * shrinks[2]).sum(axis=1) / (seen**2).sum(axis=1)
         self._unknown = 1 - known  # share of the middle prior's variance that is left
 

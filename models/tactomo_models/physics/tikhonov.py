@@ -80,13 +80,12 @@ def noise_figure_weight(
     """Regularisation parameter at which the noise figure of a small central target is 1."""
     from scipy.optimize import brentq  # 10 MB, and only `noser` asks for it
 
-    whitened = J / noise[:, None]
-    signal = whitened @ target
-    left, singular, right = np.linalg.svd(whitened * prior_scale, full_matrices=False)
+    signal = J @ target / noise
+    left, singular, right = np.linalg.svd(J / noise[:, None] * prior_scale, full_matrices=False)
     scale = float(np.mean(singular**2))
     signal_modes = left.T @ signal
     modes = right * prior_scale  # of the image, each by the data's mode of the same place
-    noise_modes = np.mean(modes**2, axis=1)
+    noise_modes = np.vecdot(modes, modes) / modes.shape[1]
 
     def log_figure(log_weight: float) -> float:
         gain = singular / (singular**2 + scale * np.exp(log_weight))

@@ -178,7 +178,9 @@ def test_a_device_in_anothers_place_and_a_command_that_it_refuses_are_told(bench
     assert "tare" in event["next_step"]
     assert b.step()["flags"] == []
     line.say(Acknowledge(3, CommandCode.START, AckStatus.BUSY))
-    assert "BUSY" in b.listener.event("command_refused")["detail"]
+    refused = b.listener.event("command_refused")
+    assert "BUSY" in refused["detail"]
+    assert "PROTOCOL.md" in refused["next_step"]
 
 
 def test_a_port_that_this_process_holds_is_busy(bench: Start) -> None:

@@ -138,6 +138,17 @@ def test_boards_of_another_skin_are_named_at_the_start(
     assert "exchange" in told["next_step"]
 
 
+def test_a_twin_by_another_description_of_the_same_sheet_is_no_exchanged_cable(
+    bench: Start,
+) -> None:
+    for device_id in ("twin-paper_square", "twin-graded_square"):
+        b = bench(baseline={"track": True}, real=True)
+        b.skin.lines[0].hello = replace(b.skin.lines[0].hello, device_id=device_id)
+        b.tare()
+        b.daemon.stop()
+    assert "device_changed" not in [told["name"] for told in b.listener.of("event")]
+
+
 @pytest.mark.slow
 def test_where_somebody_moves_at_the_start_the_reference_that_was_kept_is_used(begin: Any) -> None:
     once(begin)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tactomo_client import Keys
 from tactomo_client.schema import STALE_AFTER_S
 from tactomo_models import DescriptionError, load_description
-from tactomo_models.array_files import NUMBERS
+from tactomo_models.array_files import NUMBERS, bounded
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scans.plausibility import Layout
 from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
@@ -237,7 +237,7 @@ def _scans_of_port(recording: Recording, port: int) -> list[_Taken]:
         if isinstance(packet, Hello):
             hello = packet
         elif isinstance(packet, Scan) and hello is not None:
-            volts = packet.volts(hello.volts_per_count)
+            volts = bounded(packet.volts(hello.volts_per_count))
             kept = (packet.channel, packet.counter, packet.device_us, packet.flags)
             scans.append(_Taken(*kept, volts, clock_ns))
     return scans
