@@ -235,7 +235,14 @@ class MujocoSkin:
         a = (3 * force_n * radius_m / (4 * self._modulus_pa)) ** (1 / 3)
         a = max(a, self._simulator.spacing_m)  # less than the mesh can show
         peak_kpa = 3 * force_n / (2 * np.pi * a**2) * 1e-3
-        return Press(float(x_m), float(y_m), peak_kpa, a, profile="dome")
+        stretching = self.description.stretching
+        if stretching is None:
+            return Press(float(x_m), float(y_m), peak_kpa, a, profile="dome")
+        # A circle on the surface is an ellipse on the sheet.
+        times, axes = np.linalg.eigh(stretching.stretch_of(np.array([[[x_m, y_m]]]))[0])
+        a_x, a_y = (a / times).tolist()
+        angle = float(np.arctan2(*axes[::-1, 0]))
+        return Press(float(x_m), float(y_m), peak_kpa, a_x, a_y, angle, profile="dome")
 
     def _share_on_sheet(self, press: Press) -> float:
         """Share of a contact's force on the area that can be pressed.

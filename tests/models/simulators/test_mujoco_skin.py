@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 from page import Page
+from stretched import along, on_surface
 from tactomo_models import DataError, load_description
 from tactomo_models.sensor.companion import Companion
 from tactomo_models.simulators.mujoco_skin import MujocoSkin, Touch
@@ -81,6 +82,19 @@ def test_a_ball_is_found_where_it_presses_and_as_hard(tilt: float) -> None:
     assert (contact.x_m * 1e3, contact.y_m * 1e3) == pytest.approx((20, -15), abs=1)
     assert contact.force_n == pytest.approx(90, rel=0.15)
     assert contact.area_m2 == pytest.approx(np.pi * 0.0139**2, rel=0.15)
+
+
+@pytest.mark.slow
+def test_a_ball_is_as_large_on_a_sheet_that_is_stretched() -> None:
+    """The plate is the sheet at 1.2 times its width."""
+    stretched = on_surface(load_description("paper_square"), along(1.2, 1.0))
+    touch = felt(body("ball", BALL, 24, -15, 90), description=stretched, method="fit")
+    assert touch.force_n == pytest.approx(90, rel=0.01)
+    assert 1.2 * truth_n(touch) == pytest.approx(touch.force_n, rel=0.02)
+    assert touch.truth_kpa.max() == pytest.approx(221, rel=0.04)
+    (contact,) = touch.frame.contacts
+    assert contact.position_m == pytest.approx((0.024, -0.015, 0.0), abs=1e-3)
+    assert contact.force_n == pytest.approx(90, rel=0.15)
 
 
 def test_several_contacts_add_up() -> None:
