@@ -1176,6 +1176,22 @@ def test_a_server_given_up_for_its_silence_is_asked_again_once(page: Page) -> No
     assert sockets == 2
 
 
+def test_what_waits_in_a_busy_page_grows_old(page: Page) -> None:
+    page.open()
+    oldest_ms = page.browser.execute_async_script("""
+        const done = arguments[0], ages = [], { timeline } = tactomo, { add } = timeline;
+        timeline.add = (frame) => {
+          ages.push(performance.now() - frame.receivedAt + frame.age_ms);
+          add.call(timeline, frame);
+        };
+        setTimeout(() => {
+          const begun = performance.now();
+          while (performance.now() - begun < 1500);
+          setTimeout(() => done(Math.max(...ages)), 500);
+        }, 500)""")
+    assert oldest_ms > 1000
+
+
 @pytest.mark.slow
 def test_a_daemon_that_never_came_is_waited_for(page: Page) -> None:
     page.skin.__exit__()

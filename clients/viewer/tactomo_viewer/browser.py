@@ -21,7 +21,7 @@ from tactomo_client import ClientError, ControlError, aio
 from tactomo_client.appearance import companion_words
 
 from tactomo_viewer.feed import Feed
-from tactomo_viewer.wire import frame_message, json_text
+from tactomo_viewer.wire import frame_message, json_text, sent_ms
 
 MAX_UNCONFIRMED = 2
 MAX_ANSWERS = 16
@@ -129,7 +129,7 @@ class Browser:
         return True
 
     async def _send(self, kind: str, **fields: Any) -> None:
-        await self._socket.send_str(json_text({"type": kind, **fields}))
+        await self._socket.send_str(json_text({"type": kind, "sent_ms": sent_ms(), **fields}))
 
     # From the page
 

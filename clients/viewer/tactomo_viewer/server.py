@@ -22,7 +22,7 @@ from tactomo_client.schema import FRAME_STALE_AFTER_S, STALE_AFTER_S
 
 from tactomo_viewer.browser import Browser
 from tactomo_viewer.feed import Feed
-from tactomo_viewer.wire import json_text
+from tactomo_viewer.wire import json_text, sent_ms
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8750
@@ -150,7 +150,7 @@ class Viewer:
             heartbeat=10.0, max_msg_size=MAX_QUESTION_BYTES, compress=False
         )
         await socket.prepare(request)
-        await socket.send_str(json_text({"type": "hello", **self._about}))
+        await socket.send_str(json_text({"type": "hello", "sent_ms": sent_ms(), **self._about}))
         browser = Browser(socket, self._feed, self._daemon, self._twin)
         browser.twin_presses = self._twin_presses
         self._browsers.add(browser)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import time
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ def frame_message(frame: Frame) -> bytes:
     """Return the binary message of a frame; its age is the age now."""
     images = {name: image for name in IMAGES if (image := getattr(frame, name)) is not None}
     header = {
+        "sent_ms": sent_ms(),
         "age_ms": frame.age_s * 1e3,
         "session": frame.session,
         "sequence": frame.sequence,
@@ -41,6 +43,11 @@ def frame_message(frame: Frame) -> bytes:
     text += b" " * (-len(text) % 4)
     values = [np.ascontiguousarray(image, "<f4").tobytes() for image in images.values()]
     return b"".join([len(text).to_bytes(4, "little"), text, *values])
+
+
+def sent_ms() -> float:
+    """Return when a message is sent, in ms of this process's clock, by which a page dates it."""
+    return time.monotonic() * 1e3
 
 
 def json_text(value: Any) -> str:

@@ -25,10 +25,10 @@ export class Replay {
    * Take what a status says; its `replay` is null where nothing is replayed. One that waits for the
    * page goes on once somebody sees its first frame.
    */
-  show({ fields: { replay: fields, state }, age_ms }, hello, hasFrame) {
+  show({ fields: { replay: fields, state }, age_ms, receivedAt }, hello, hasFrame) {
     byId("replay").hidden = !fields;
     if (!fields) return;
-    Object.assign(this, { fields, state, shownAt: performance.now() - age_ms });
+    Object.assign(this, { fields, state, shownAt: receivedAt - age_ms });
     for (const control of byId("replay").querySelectorAll("button, input, select")) {
       control.disabled = Boolean(hello?.read_only);
     }

@@ -92,16 +92,16 @@ function onMessage(message) {
       timeline.events = [];
     },
     status: () => {
-      state.status = { fields: message.status, age_ms: message.age_ms, receivedAt: performance.now() };
+      state.status = { fields: message.status, age_ms: message.age_ms, receivedAt: message.receivedAt };
       if (message.status.state === "taring") state.taredAt = performance.now();
       describe(message.status.description);
       showStatus(message.status, true);
       replay.show(state.status, state.hello, state.drawn !== null);
     },
     event: () => {
-      const at = performance.now() - message.age_ms;
+      const at = message.receivedAt - message.age_ms;
       const position = replay.positionAt(at);
-      showEvent(message.event, Date.now() - message.age_ms, () => goTo(at, position));
+      showEvent(message.event, Date.now() - (performance.now() - at), () => goTo(at, position));
       timeline.note(message.event, at);
     },
     twin: () => { state.twin = message; },
