@@ -11,7 +11,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
-from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    Field,
+    ValidationError,
+    model_validator,
+)
 from pydantic_core import ErrorDetails
 from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, MessageError
 from tactomo_client.messages import check_sensor_name
@@ -60,6 +67,13 @@ def _protocol(name: str) -> str:
     return name
 
 
+def _path(path: Any) -> Any:
+    if path == "" or "\0" in str(path):
+        raise ValueError("give the path of a file or folder, which is not empty and has no NUL")
+    return path
+
+
+FilePath = Annotated[Path, BeforeValidator(_path)]
 Endpoint = Annotated[str, AfterValidator(check_endpoint)]
 MethodName = Annotated[str, AfterValidator(_method)]
 ProtocolName = Annotated[str, AfterValidator(_protocol)]
@@ -71,19 +85,19 @@ BudgetMs = Annotated[float, Field(ge=0.01, le=10_000)]
 class Curve(BaseModel, extra="forbid", frozen=True):
     """Keys for addresses beyond this computer; `tactomo keys` makes and manages both."""
 
-    secret: Path  # the daemon's secret key, which only its user may read
-    clients: Path  # a folder of the public keys of those who may connect
+    secret: FilePath  # the daemon's secret key, which only its user may read
+    clients: FilePath  # a folder of the public keys of those who may connect
 
 
 class RecordingConfig(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """Where recordings go, how they are cut into files, and which of those are kept."""
 
     # Record to this one file from the start; it is not cut and not deleted
-    file: Path | None = None
+    file: FilePath | None = None
     at_start: bool = False  # record to the folder from the start
     maps: bool = False  # put maps and contacts into recordings, beside the raw bytes
     # Where recordings without a name of their own go, cut into files as follows
-    folder: Path | None = None
+    folder: FilePath | None = None
     rotate_mb: Annotated[float, Field(ge=0.01, le=100_000)] = 256.0
     rotate_minutes: Annotated[float, Field(ge=0.01, le=1440)] = 60.0
     # Of this sensor's files in the folder, the newest so many; 0 for no limit
@@ -121,9 +135,9 @@ class DaemonConfig(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     # This sensor's name in every topic, such as ``left_forearm``
     name: Annotated[str, AfterValidator(_sensor_name)] = "skin"
     # A shipped sensor description's name, or the path of a TOML file
-    description: str = "paper_square"
+    description: Annotated[str, BeforeValidator(_path)] = "paper_square"
     # Of pressure, by `tactomo calibrate`; None for the sensor's own, where there is one
-    calibration: Path | None = None
+    calibration: FilePath | None = None
     # Device paths or pyserial URLs: one that carries both channels, or one for each
     ports: Annotated[tuple[str, ...], Field(min_length=1, max_length=MAX_PORTS)]
     # The devices that make up this sensor, as their hello says; empty accepts any

@@ -49,7 +49,8 @@ def check_endpoint(endpoint: str) -> str:
 
     Port 0 means any free one. Raises ValueError for anything else, saying what may be used.
     """
-    if endpoint.startswith(IPC) and endpoint[len(IPC) :][:1] not in ("", "@"):
+    path = endpoint.removeprefix(IPC)
+    if path != endpoint and path[:1] not in ("", "@") and "\0" not in path:
         return endpoint
     try:
         parts = urlsplit(endpoint)

@@ -67,7 +67,8 @@ class Recorder(Worker):
         self._folder: Path | None = None  # where a set of files is recorded, or is to be
         self._with_maps = rules.maps  # as was asked for, for all files of a set
         self._ending: ActiveRecording | None = None  # the file before, while that goes on
-        self._last = (Path(), 0)  # the newest file that was closed
+        # the newest file that was closed since the start of what is recorded, and its bytes
+        self._last: tuple[Path, int] | None = None
         self._next_try_s = self._next_look_s = 0.0
         self._requests: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = (
             queue.SimpleQueue()
@@ -210,7 +211,7 @@ class Recorder(Worker):
         folder = self._rules.folder_path if path is None else None
         self._with_maps = with_maps
         self.active = self._create(path)
-        self._folder, self.waits_for, self.failure = folder, "", ""
+        self._folder, self.waits_for, self.failure, self._last = folder, "", "", None
         self._on_event("recording_started", str(self.active.path))
         self._delete_old()
         return {"path": str(self.active.path)}
@@ -262,7 +263,7 @@ class Recorder(Worker):
         )
 
     def _end(self) -> Mapping[str, Any]:
-        active, is_wanted = self.active, self._folder is not None
+        active, is_wanted, why = self.active, self._folder is not None, self.waits_for
         self.active, self._folder, self.waits_for = None, None, ""
         if active is not None:
             self._finish(active)
@@ -271,6 +272,10 @@ class Recorder(Worker):
         elif not is_wanted:
             raise CommandError(
                 "nothing is being recorded", "start with record_start", "not_recording"
+            )
+        if self._last is None:
+            raise RecordingError(
+                f"no recording was kept: {self.failure or why}", _REST, "cannot_write"
             )
         path, length = self._last
         return {"path": str(path), "bytes": length}

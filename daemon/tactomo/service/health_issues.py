@@ -200,7 +200,7 @@ def _of_losses(status: Mapping[str, Any]) -> Iterator[HealthIssue]:
 
 def _of_recorder(recorder: Mapping[str, Any]) -> Iterator[HealthIssue]:
     if recorder.get("waits_for"):
-        step = "free some space or mend the disk; recording begins again by itself"
+        step = "see that the folder is there and the disk takes more; recording goes on by itself"
         yield HealthIssue("error", f"nothing is recorded: {recorder['waits_for']}", step)
     elif recorder.get("failure"):
         step = "free some space or mend the disk, then record anew: `tactomo record start`"

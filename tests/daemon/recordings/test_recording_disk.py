@@ -273,6 +273,12 @@ def test_a_deleted_file_or_folder_is_noticed(bench: Start, tmp_path: Path) -> No
     assert "deleted" in told(b, "recording_failed")[0]["detail"]
     b.ask("record_start")
     shutil.rmtree(folder)
+    step_until(b, lambda: b.ask("status")["recorder"]["waits_for"])
+    with pytest.raises(ControlError, match=r"no recording was kept: .*deleted"):
+        b.ask("record_stop")
+    assert b.ask("status")["recorder"]["waits_for"] is None
+    b.ask("record_start")
+    shutil.rmtree(folder)
     step_until(b, lambda: told(b, "recording_resumed"))
     b.step()
     end = b.ask("record_stop")

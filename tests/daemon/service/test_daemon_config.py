@@ -47,6 +47,11 @@ def config_file(folder: Path, text: str) -> Path:
         ("ports = ['a']\n[recording]\nkeep_gb = 0.9", "no room for four files"),
         ("ports = ['a']\n[recording]\nfile = 'a'\nat_start = true", "give one of them"),
         ("ports = ['a']\n[recording]\nmap = true", "unknown key recording.map"),
+        ("ports = ['a']\n[recording]\nfolder = ''", "recording.folder = '': give the path"),
+        ('ports = ["a"]\n[recording]\nfile = "a\\u0000"', "not empty and has no NUL"),
+        ('ports = ["a"]\ncalibration = "a\\u0000"', "not empty and has no NUL"),
+        ('ports = ["a"]\ndescription = "a\\u0000"', "not empty and has no NUL"),
+        ('ports = ["a"]\nstream = "ipc://a\\u0000"', "or ipc://PATH"),
     ],
 )
 def test_a_bad_file_is_refused_with_the_reason(tmp_path: Path, text: str, said: str) -> None:
