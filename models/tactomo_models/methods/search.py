@@ -240,21 +240,26 @@ class Search:
         """The best of what is proposed, and of nothing."""
         frame.budget.left_s -= COLD_S
         nothing = self._account(np.zeros((0, COLUMNS)), self.fit.likely, frame)
-        starts = [nothing, *self._proposed(frame)]
+        starts = [nothing]
+        for each in self._proposed(frame):
+            if len(starts) == 2:  # the same as one: not where several explain the data
+                starts[1] = self._descended(starts[1], frame, FEW_STEPS)
+                if frame.likelihood.explains(starts[1].chi_squared):
+                    break
+            starts.append(self._account(each, self.fit.likely, frame))
         best = self._best(starts, frame)
         return self._begun(best, frame, "cold start" if best.family.count == 0 else "proposed")
 
-    def _proposed(self, frame: Frame) -> Iterator[Account]:
-        """What a network proposes; and the same as one contact, where it fills half of that."""
+    def _proposed(self, frame: Frame) -> Iterator[FloatArray]:
+        """What a network proposes (K, COLUMNS), then the same as one that it fills half of."""
         each = frame.propose()[:MAX_CONTACTS] if frame.propose else np.zeros((0, COLUMNS))
         each[:, PEAK] = self._start_peak(frame)
-        starts = [each] if len(each) else []
+        if len(each):
+            yield each
         if len(each) > 1:
             one = as_one(each)
             if np.exp(2 * each[:, SIZE]).sum() > np.exp(2 * one[SIZE]) / 2:
-                starts.append(one[None])
-        for start in starts:
-            yield self._account(start, self.fit.likely, frame)
+                yield one[None]
 
     def _best(self, starts: list[Account], frame: Frame) -> Account:
         """The likeliest of starts, after a few steps each; there is at least one."""
@@ -277,7 +282,9 @@ class Search:
             starts.append(self._account(one, before.fitted.log_ratio, frame))
         if left is not before:
             starts.append(self._with_missing(left, frame, far=True))
-        best = self._best([*starts, *self._proposed(frame)], frame)
+        for each in self._proposed(frame):
+            starts.append(self._account(each, self.fit.likely, frame))
+        best = self._best(starts, frame)
         begun = self._begun(best, frame, "warm start")
         return replace(begun, challenged=best.chi_squared)
 
