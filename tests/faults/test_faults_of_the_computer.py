@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 import tactomo_models
 from fixture_types import Figure, Listen, Play, StartProcess
-from pty_skin import Scenes, moving
+from pty_skin import PtySkin, Scenes, moving, still
 from tactomo.recordings.recording import open_recording
 from tactomo_protocol import Decoder, Scan
+from waiting import wait_until
 
 KILLS = 10
 
@@ -64,6 +65,44 @@ def test_killed_while_recording(
         lost_s.append((killed_ns - sent[last]) * 1e-9)
     figure(f"lost {np.median(lost_s):.2f} s (median), {max(lost_s):.2f} s (worst)")
     assert max(lost_s) < 0.25 + 0.05  # what was on its way from the pseudo-terminal
+
+
+@pytest.mark.faults
+@pytest.mark.fault(
+    "SIGKILL while recording under a press, then a restart",
+    "the same addresses; the contact is shown by the reference of before, and flagged until the "
+    "skin was at rest; nothing claims to be recorded; the file opens",
+    "a contact that moves, 20 dual scans/s, before and after",
+)
+def test_killed_under_a_press_and_started_again(
+    tared: StartProcess,
+    start: StartProcess,
+    skin: PtySkin,
+    scenes: Scenes,
+    play: Play,
+    listen: Listen,
+    figure: Figure,
+    tmp_path: Path,
+) -> None:
+    addresses = {name: f"ipc://{tmp_path}/{name}" for name in ("stream", "control")}
+    daemon = tared(**addresses)
+    daemon.ask("record_start", path="killed.mcap")
+    pressing = play(moving(scenes.one))
+    time.sleep(1.0)
+    daemon.kill()
+    began_s = time.monotonic()
+    again = start(skin.paths, **addresses)
+    ears = listen(again)
+    first = ears.wait(lambda h: h.fields["contacts"], "the contact that is still there")
+    figure(f"shown again {time.monotonic() - began_s:.1f} s after the kill")
+    assert first.fields["flags"] == ["reference_disputed"]
+    status = again.status()
+    assert (status["recording"], status["recorder"]["files"]) == (None, 0)
+    pressing.stop()
+    play(still(scenes.rest))
+    wait_until(lambda: again.told("reference_confirmed"), "a skin at rest")
+    ears.wait(lambda h: not h.fields["contacts"] and not h.fields["flags"], "no flag")
+    assert counters(tmp_path / "killed.mcap")
 
 
 @pytest.mark.faults
