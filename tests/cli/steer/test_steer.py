@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from threading import Timer
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +16,8 @@ from typing import Any
 import pytest
 from fake_control import FakeControl
 from fixture_types import Run
+from tactomo.cli.steer.status import lines_of
+from tactomo.errors import TactomoError
 from tactomo.running import Running, announced
 from tactomo.service.health_issues import FLAG_ADVICE, health_issues
 from tactomo_client import ControlError
@@ -197,6 +200,17 @@ def test_status_prints_what_the_daemon_finds_and_judges_nothing_itself(
     control.answers["status"] = {**STATUS, "state": "stale", "issues": told}
     shown = tactomo("status").stdout
     assert shown.splitlines()[:3] == ["it hums", "    oil it", "left_forearm: stale"]
+
+
+def test_a_status_that_no_daemon_sends_ends_in_no_traceback(tactomo: Run, control: Any) -> None:
+    for key in STATUS:
+        for value in (None, 7, "x", [], [1], {"a": 1}, 1e308):
+            with suppress(TactomoError):
+                lines_of({**STATUS, key: value})
+    control.answers["status"] = {**STATUS, "uptime_s": "long"}
+    said = tactomo("status", status=1).stderr
+    assert said.startswith("tactomo: what answers is no daemon of this version: ")
+    assert "tactomo status --json" in said
 
 
 def test_flags_and_counts_are_told_in_words(tactomo: Run, control: Any) -> None:

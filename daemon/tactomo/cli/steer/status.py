@@ -7,8 +7,9 @@ from typing import Any
 import typer
 
 from tactomo.cli import options
-from tactomo.cli.output import print_json, say
+from tactomo.cli.output import print_json
 from tactomo.cli.sensors import newest_status
+from tactomo.errors import TactomoError
 from tactomo.plain import counted, plain
 
 app = options.typer_app()
@@ -37,14 +38,28 @@ def status(
     if as_json:
         print_json(answer)
         return
-    answer = _plain(answer)
-    for issue in answer.get("issues") or []:
-        colour = "red" if issue["severity"] == "error" else "yellow"
-        typer.secho(issue["what"], fg=colour, bold=True)
-        say(f"    {issue['next_step']}")
-    say(f"{answer['sensor']}: {_words(answer['state'])}")
-    for name, value in _rows(answer):
-        typer.echo(f"{typer.style(f'{name:<13} ', bold=True)}{value}")
+    for line in lines_of(_plain(answer)):
+        typer.echo(line)
+
+
+def lines_of(status: dict[str, Any]) -> list[str]:
+    """Return what is printed of a status.
+
+    Raises TactomoError where another program, or another version, made it of other types.
+    """
+    lines = []
+    try:
+        for issue in status.get("issues") or []:
+            colour = "red" if issue["severity"] == "error" else "yellow"
+            lines += [typer.style(issue["what"], fg=colour, bold=True), f"    {issue['next_step']}"]
+        lines.append(f"{status['sensor']}: {_words(status['state'])}")
+        rows = _rows(status)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise TactomoError(
+            f"what answers is no daemon of this version: its status has no such values ({error})",
+            "see them by `tactomo status --json`; install the version of that daemon",
+        ) from error
+    return lines + [f"{typer.style(f'{name:<13} ', bold=True)}{value}" for name, value in rows]
 
 
 def _plain(told: Any) -> Any:
