@@ -129,6 +129,24 @@ def test_a_contact_that_lasts_is_never_erased(life: Life, kpa: float) -> None:
     assert life.tracker.drift[Channel.STRUCTURE].uneven < 1e-3
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("diameter_m", "kpa", "comes_s"), [(0.11, 10.0, 1.0), (0.08, 3.0, 600.0)])
+def test_a_palm_that_comes_is_one_contact(
+    life: Life, diameter_m: float, kpa: float, comes_s: float
+) -> None:
+    """Once they were four and nine contacts in two frames of three, and no flag."""
+    palm = Press(0.0, 0.0, kpa, radius_m=diameter_m / 2)
+    step_s = max(comes_s / 300, 0.025)
+    frames = life.lives(
+        comes_s,
+        step_s=step_s,
+        presses_at=lambda share: (replace(palm, pressure_kpa=share * kpa),),
+    )
+    several = [len(frame.contacts) > 1 and not frame.flags for frame in frames]
+    assert np.mean(several) < 0.05
+    assert set(count(life.lives(10 * step_s, palm, step_s=step_s))) == {1}
+
+
 def test_a_touch_that_stays_when_a_press_is_eased_is_not_taken_for_creep(life: Life) -> None:
     life.lives(600, PRESS, step_s=10.0)
     assert set(count(life.lives(120, TOUCH))) == {1}
