@@ -399,6 +399,10 @@ def test_outlines_colours_and_verdicts_are_computed_right(page: Page) -> None:
         np.testing.assert_allclose(np.reshape(table, (256, 3)), expected, atol=9)
     # A replay that goes on is not stale before its next frame.
     assert page.module(VERDICTS, "health.js") == [None, "stale"]
+    # What waited in the page is late by no failure of the skin's.
+    assert page.module(WAITED, "health.js") == [
+        *(["error", False], ["warning", True], ["error", False])
+    ]
     # A page whose first frame has not come yet only waits: red is for failures.
     verdicts = [None, ["no-frame", "info"], ["no-frame", "error"]]
     assert page.module(FIRST_FRAME, "health.js") == verdicts
@@ -439,6 +443,16 @@ VERDICTS = """
       frame: { age_ms: 26_000, receivedAt: 1e6 },
       stoodAt: 1e6 - ms,
     }, 1e6)?.name)"""
+
+
+WAITED = """
+    [[800, 10], [800, 800], [9000, 800]].map(([ms, waitedMs]) => m.verdict({
+      link: { isOpen: true },
+      hello: { status_stale_ms: 5000, frame_stale_ms: 500 },
+      status: { age_ms: 0, receivedAt: 1e6, fields: { state: 'running' } },
+      frame: { age_ms: 20, receivedAt: 1e6 - ms, waitedMs },
+      stoodAt: -Infinity,
+    }, 1e6)).map(({ level, detail }) => [level, detail.includes("too slowly")])"""
 
 
 FIRST_FRAME = """

@@ -78,9 +78,13 @@ export function verdict(state, now) {
     return banner("no-frame", waited < 1000 * SOON_S ? "info" : "error", "No frame yet.", wrong);
   }
   const age = Math.min(ageOf(frame, now), now - state.stoodAt);
-  if (age > staleAfter(fields, hello)) {
+  const most = staleAfter(fields, hello);
+  if (age > most) {
     const since = `The newest frame is ${seconds(age)} old`;
-    return banner("stale", "error", "Stale.", [since, wrong].filter(Boolean).join("; "));
+    const sinceTaken = now - frame.receivedAt - frame.waitedMs;  // no more than a slow page takes to draw
+    const isSlow = frame.waitedMs > most / 2 && sinceTaken < hello.status_stale_ms;
+    const slow = isSlow && "this computer draws the page too slowly";
+    return banner("stale", isSlow ? "warning" : "error", "Stale.", [since, slow, wrong].filter(Boolean).join("; "));
   }
   const [issue] = errors;
   return issue ? banner("issue", "warning", `${issue.what}:`, issue.next_step) : null;

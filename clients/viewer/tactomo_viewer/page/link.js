@@ -7,7 +7,8 @@ const CLOCK_MS = 30_000;  // how often the least delay of messages is found anew
 export class Link {
   /**
    * `onFrame(frame)` and `onMessage(message)` are called as they come, with `receivedAt`, when they
-   * came by performance.now(); `onChange()` on open and close.
+   * came by performance.now(), and `waitedMs`, how long the page let them wait; `onChange()` on open
+   * and close.
    */
   constructor({ onFrame, onMessage, onChange }) {
     Object.assign(this, { onFrame, onMessage, onChange });
@@ -74,7 +75,8 @@ export class Link {
     const { since, least } = this.clock;
     if (now - since > CLOCK_MS) this.clock = { since: now, least: Infinity, before: least };
     this.clock.least = Math.min(this.clock.least, now - message.sent_ms);
-    return { ...message, receivedAt: message.sent_ms + Math.min(this.clock.least, this.clock.before) };
+    const receivedAt = message.sent_ms + Math.min(this.clock.least, this.clock.before);
+    return { ...message, receivedAt, waitedMs: now - receivedAt };
   }
 
   #closed(socket) {

@@ -92,7 +92,8 @@ function onMessage(message) {
       timeline.events = [];
     },
     status: () => {
-      state.status = { fields: message.status, age_ms: message.age_ms, receivedAt: message.receivedAt };
+      // Taken, it tells that the daemon is there, however long it waited in this page.
+      state.status = { fields: message.status, age_ms: message.age_ms, receivedAt: performance.now() };
       if (message.status.state === "taring") state.taredAt = performance.now();
       describe(message.status.description);
       showStatus(message.status, true);
