@@ -148,6 +148,8 @@ class Pipeline(Worker):
             except queue.Full:
                 if not self._is_lossless:
                     self._discard_oldest()
+                elif not self.is_alive:  # nobody takes more: the daemon ends
+                    return
 
     def tare(self) -> Future[Mapping[str, Any]]:
         """Ask for a new reference; for any thread. The future gets its `scans` and `contacts`.

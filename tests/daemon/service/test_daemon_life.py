@@ -17,7 +17,9 @@ from daemon_process import DaemonProcess
 from fixture_types import Start
 from tactomo.config import load_config
 from tactomo.errors import ConfigError, TactomoError
+from tactomo.imaging.pipeline import QUEUED_DELIVERIES
 from tactomo.recordings.recording import open_recording
+from tactomo.scans import Delivery
 from tactomo.service.daemon import Daemon
 from waiting import PATIENCE_S, wait_until
 
@@ -163,3 +165,19 @@ def test_a_thread_that_dies_takes_the_daemon_down(bench: Start) -> None:
         assert b.daemon.wait() == 1
     finally:
         threading.excepthook = hook
+
+
+def test_a_port_that_may_lose_nothing_does_not_wait_for_a_thread_that_died(bench: Start) -> None:
+    """The daemon hung then, whatever signal came."""
+    pipeline = bench(lossless=True).daemon._pipeline
+    pipeline.stop()
+    pipeline._stopping.clear()  # as of a thread that died by itself
+
+    def deliver() -> None:
+        for _ in range(QUEUED_DELIVERIES + 1):
+            pipeline.deliver(Delivery(0, 0, ()))
+
+    port = threading.Thread(target=deliver, daemon=True)
+    port.start()
+    port.join(PATIENCE_S)
+    assert not port.is_alive()
