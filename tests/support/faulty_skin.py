@@ -43,6 +43,7 @@ def shorted(simulator: SkinSimulator, first: int, second: int) -> SkinSimulator:
     electrodes = bare.transfer @ between
     nodes = bare.potentials @ between[:-1]
     resistance = between @ electrodes
+    every = np.arange(len(nodes))
     made = copy.copy(simulator)
     made._last = None
     made.forward = ForwardModel(
@@ -52,7 +53,7 @@ def shorted(simulator: SkinSimulator, first: int, second: int) -> SkinSimulator:
             transfer=bare.transfer - np.outer(electrodes, electrodes) / resistance,
             potentials=bare.potentials - np.outer(nodes, electrodes[:-1]) / resistance,
             green=PackedGreensFunction(
-                (bare.green.columns(np.arange(len(nodes))) - np.outer(nodes, nodes) / resistance)[
+                (bare.green.between(every, every) - np.outer(nodes, nodes) / resistance)[
                     np.tril_indices(len(nodes))
                 ]
             ),

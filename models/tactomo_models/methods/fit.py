@@ -149,9 +149,7 @@ class Fit:
         companions = measurement.companions
         disputed = {k: one for k, one in course.disputed.items() if k in companions}
         trusted = {k: one for k, one in companions.items() if k not in disputed}
-        fitted, judged = self._followed(
-            course, replace(measurement, companions=trusted), Budget(budget_s)
-        )
+        fitted, judged = self._beside(course, measurement, trusted, budget_s)
         assert fitted.belief is not None
         if fitted.belief.how != "still":
             disputed = {k: companions[k] for k in disputed}
@@ -162,6 +160,16 @@ class Fit:
         if again:
             return self._trusted_again(fitted, judged, measurement, again, budget_s)
         return fitted, judged
+
+    def _beside(
+        self,
+        course: Course,
+        measurement: Measurement,
+        companions: Mapping[str, CompanionForce],
+        budget_s: float,
+    ) -> tuple[Course, Measurement]:
+        """The same as `_followed`, with these companions alone beside the sheets."""
+        return self._followed(course, replace(measurement, companions=companions), Budget(budget_s))
 
     def _are_doubtful(self, fitted: Course, trusted: Mapping[str, CompanionForce]) -> bool:
         """Whether the sheets are to be asked about the companions that were fitted beside them."""
@@ -183,9 +191,7 @@ class Fit:
         budget_s: float,
     ) -> tuple[Course, Measurement]:
         """The course without the companions that the sheets alone contradict."""
-        alone, sheets = self._followed(
-            Course(drifts=fitted.drifts), replace(measurement, companions={}), Budget(budget_s)
-        )
+        alone, sheets = self._beside(Course(drifts=fitted.drifts), measurement, {}, budget_s)
         assert fitted.belief is not None
         assert alone.belief is not None
         if not (alone.belief.is_explained or alone.belief.done):
@@ -229,16 +235,11 @@ class Fit:
         assert fitted.belief is not None
         if fitted.belief.how == "still":  # fitted to another frame, whose noise is another
             trusted = {k: companions[k] for k in fitted.believed}
-            anew, judged = self._followed(
-                Course(drifts=fitted.drifts),
-                replace(measurement, companions=trusted),
-                Budget(budget_s),
-            )
+            cold = Course(drifts=fitted.drifts)
+            anew, judged = self._beside(cold, measurement, trusted, budget_s)
             fitted = replace(anew, believed=fitted.believed, disputed=fitted.disputed)
         kept = {k: companions[k] for k in fitted.believed | again.keys()}
-        beside, beside_judged = self._followed(
-            fitted, replace(measurement, companions=kept), Budget(budget_s)
-        )
+        beside, beside_judged = self._beside(fitted, measurement, kept, budget_s)
         assert fitted.belief is not None
         assert beside.belief is not None
         if not beside.belief.is_explained or _are_unlikely(again, beside.belief, fitted.belief):

@@ -13,7 +13,6 @@ Source: Przemieniecki, "Matrix structural analysis of substructures", AIAA J. 1 
 
 from __future__ import annotations
 
-from math import isqrt
 from typing import Any
 
 import numpy as np
@@ -35,7 +34,6 @@ class PackedGreensFunction:
 
     def __init__(self, lower: NDArray[Any]) -> None:
         self.lower = lower
-        self._size = isqrt(2 * len(lower))
 
     def between(self, rows: IntArray, columns: IntArray) -> FloatArray:
         """Potentials (r, c) at some of the nodes for unit currents into others, by their places."""
@@ -48,10 +46,6 @@ class PackedGreensFunction:
         of_block = len(rows), at(rows), len(columns), at(columns)
         LIBRARY.block_of(*by_precision, *of_block, at(found))
         return found
-
-    def columns(self, columns: IntArray) -> FloatArray:
-        """Potentials (S, c) at all nodes for unit currents into some."""
-        return self.between(np.arange(self._size), columns)
 
 
 class GreensFunction:
@@ -101,10 +95,6 @@ class GreensFunction:
         used = np.unique(np.concatenate([here.indices, there.indices]))
         onto = self._between[np.ix_(used, used)] @ there[:, used].toarray().T
         return np.asarray(self._within[rows][:, columns].toarray() + here[:, used] @ onto)
-
-    def columns(self, columns: IntArray) -> FloatArray:
-        """Potentials (S, c) at all nodes for unit currents into some."""
-        return self.between(np.arange(self._weights.shape[0]), columns)
 
     def packed(self, dtype: DTypeLike = np.float64) -> PackedGreensFunction:
         """All of it, of which a block is a look-up: up to hundreds of megabytes."""

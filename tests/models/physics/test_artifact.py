@@ -47,7 +47,9 @@ def test_an_artifact_comes_back_as_it_was(
     for name in ("jacobian", "tikhonov"):
         np.testing.assert_array_equal(getattr(read, name), getattr(built, name))
     every = np.arange(len(built.bare.support))
-    np.testing.assert_array_equal(read.bare.green.columns(every), built.bare.green.columns(every))
+    np.testing.assert_array_equal(
+        read.bare.green.between(every, every), built.bare.green.between(every, every)
+    )
     assert (read.bare.map_weights != built.bare.map_weights).nnz == 0
     assert [entry.name for entry in file.parent.iterdir()] == ["small.npz"]
 
@@ -142,7 +144,9 @@ def test_a_flipped_bit_is_refused_or_harmless(
         file.unlink()
     np.testing.assert_array_equal(read.jacobian, built.jacobian)
     every = np.arange(len(built.bare.support))
-    np.testing.assert_array_equal(read.bare.green.columns(every), built.bare.green.columns(every))
+    np.testing.assert_array_equal(
+        read.bare.green.between(every, every), built.bare.green.between(every, every)
+    )
 
 
 def test_a_disk_that_fills_up_leaves_nothing_under_the_name(
