@@ -18,7 +18,7 @@ from tactomo_models.array_files import bounded
 from tactomo_models.arrays import FloatArray
 from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_models.errors import CalibrationError, DataError
-from tactomo_models.growing_arrays import GrowingArrays
+from tactomo_models.growing_arrays import growing_arrays
 from tactomo_models.reconstruct import Reconstructor
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scans.repeats import Repeats
@@ -125,7 +125,7 @@ def reconstruct_file(
     total = max(len(channel) for channel in scans.values())
     try:
         with (
-            GrowingArrays(TYPES, shapes, _folder_of(target)) as arrays,
+            growing_arrays(TYPES, shapes, _folder_of(target)) as arrays,
             threadpool_limits(1),  # as the daemon runs: `seconds` are what a robot would see
         ):
             reconstructor = Reconstructor(

@@ -5,14 +5,13 @@ A file of frames may be larger than the memory, and how many contacts there are 
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, Final, Self
+from typing import IO, Any, Final
 
 import numpy as np
 from numpy.lib import format as npy
@@ -21,39 +20,16 @@ FAST: Final = 1  # of zlib: maps are zeros for the most part, and pack as well a
 
 
 class GrowingArrays:
-    """The arrays of one .npz file, by name. A context manager: their files go with it.
+    """The arrays of one .npz file, by name.
 
     Args:
-        types: the dtype of each.
-        shapes: of the rows of those whose rows are no single values.
-        scratch: a folder with room for all of it, uncompressed.
+        types: the dtype of each, with the shape of its rows where these are no single values.
+        files: where each grows.
     """
 
-    def __init__(
-        self, types: Mapping[str, Any], shapes: Mapping[str, tuple[int, ...]], scratch: Path
-    ) -> None:
-        self._types = {
-            name: np.dtype((dtype, shapes.get(name, ()))) for name, dtype in types.items()
-        }
+    def __init__(self, types: Mapping[str, np.dtype[Any]], files: Mapping[str, IO[bytes]]) -> None:
+        self._types, self._files = types, files
         self._rows = dict.fromkeys(types, 0)
-        with contextlib.ExitStack() as undo:
-            self._files: dict[str, IO[bytes]] = {
-                name: undo.enter_context(tempfile.TemporaryFile(dir=scratch)) for name in types
-            }
-            self._undo = undo.pop_all()
-
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Remove the files."""
-        self._undo.close()
 
     def append(self, rows: Mapping[str, Any]) -> None:
         """Add a row to each array that is named; None is a row of NaN."""
@@ -77,3 +53,16 @@ class GrowingArrays:
                     npy.write_array_header_1_0(entry, header)
                     file.seek(0)
                     shutil.copyfileobj(file, entry)
+
+
+@contextmanager
+def growing_arrays(
+    types: Mapping[str, Any],  # the dtype of each
+    shapes: Mapping[str, tuple[int, ...]],  # of the rows of those whose rows are no single values
+    scratch: Path,  # a folder with room for all of it, uncompressed
+) -> Iterator[GrowingArrays]:
+    """Arrays that grow in files of their own, which go with the context."""
+    with ExitStack() as stack:
+        files = {name: stack.enter_context(tempfile.TemporaryFile(dir=scratch)) for name in types}
+        whole = {name: np.dtype((dtype, shapes.get(name, ()))) for name, dtype in types.items()}
+        yield GrowingArrays(whole, files)

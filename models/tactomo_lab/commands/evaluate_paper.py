@@ -95,20 +95,19 @@ def paper(
 
 
 def _simulation_study(study: _Study) -> Finding:
-    from tactomo_lab.evaluation.paper import COUNTS, SNR_DB, cells, paper_scenes
+    from tactomo_lab.evaluation.paper import COUNTS, SNR_DB, paper_scenes, points_of
     from tactomo_lab.evaluation.play import play
 
     drawn = chain.from_iterable(
         paper_scenes(study.description, study.seeds, study.scenes, snr_db) for snr_db in SNR_DB
     )
     total = study.scenes * len(COUNTS) * len(SNR_DB) * len(study.methods)
-    points = cells(shown(play(drawn, *study.methods), total, "Fig. 5"))
+    points = points_of(shown(play(drawn, *study.methods), total, "Fig. 5"))
     measures = (f"{measure} {n}" for measure in ("RIE", "ICC") for n in COUNTS)
     made = table("noise", "method", *measures, left=("method",))
-    summary = {(p.snr_db, p.method, p.contacts): p.summary for p in points}
     for snr_db in SNR_DB:
         for method in study.methods:
-            of = [summary[snr_db, method, n] for n in COUNTS]
+            of = [points[method, snr_db, n] for n in COUNTS]
             values = (*(f"{s.rie:.2f}" for s in of), *(f"{s.icc:.3f}" for s in of))
             noise = f"{snr_db:g} dB" if math.isfinite(snr_db) else "none"
             made.add_row(noise if method == study.methods[0] else "", method, *values)
@@ -117,7 +116,10 @@ def _simulation_study(study: _Study) -> Finding:
         "Fig. 5: error and correlation of the map by number of contacts, simulated",
         made,
         "noise: of the voltages' changes",
-        [asdict(point) for point in points],
+        [
+            {"method": method, "snr_db": snr_db, "contacts": n, "summary": asdict(summary)}
+            for (method, snr_db, n), summary in points.items()
+        ],
     )
 
 

@@ -41,7 +41,7 @@ from tactomo_lab.scenes.case import (
     simulate,
 )
 from tactomo_lab.scenes.drawing import SeedSet, require_channels, seed_of
-from tactomo_lab.scenes.measures import Score, Summary, full_range, summarise
+from tactomo_lab.scenes.measures import Summary, full_range, summarise_by
 from tactomo_lab.scenes.presets import PAPER_CONTACTS, PAPER_CONTRAST, paper_presses
 from tactomo_lab.scenes.simulation import Volts
 from tactomo_lab.scenes.still_scenes import still_case
@@ -98,23 +98,12 @@ def paper_scenes(
         yield still_case(description, plan, seed_set, number, snr_db)
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One point of Fig. 5: a method's measures over the scenes of one count and ratio."""
-
-    method: str
-    snr_db: float
-    contacts: int
-    summary: Summary
-
-
-def cells(outcomes: Iterable[Outcome]) -> list[Cell]:
-    """Points of Fig. 5 from what became of its scenes, which need not be kept."""
-    scores: dict[tuple[str, float, int], list[Score]] = {}
-    for outcome in outcomes:
-        score = outcome.score
-        scores.setdefault((outcome.method, score.snr_db, len(score.contacts)), []).append(score)
-    return [Cell(*key, summarise(of_cell)) for key, of_cell in scores.items()]
+def points_of(outcomes: Iterable[Outcome]) -> dict[tuple[str, float, int], Summary]:
+    """Points of Fig. 5 by method, ratio and count; the outcomes need not be kept."""
+    return summarise_by(
+        ((each.method, each.score.snr_db, len(each.score.contacts)), each.score)
+        for each in outcomes
+    )
 
 
 # ------------------------------------------------------------------ Figs. 8 to 10: experiments

@@ -30,7 +30,6 @@ from tactomo_lab.scenes.case import (
     as_described,
     measure,
     simulate,
-    with_noise,
 )
 from tactomo_lab.scenes.drawing import (
     PRESSURE_KPA,
@@ -493,7 +492,4 @@ def make_case(
     skin, noise = (
         seed_of(seed_set, f"stability {regime} {what}", number) for what in ("sheet", "noise")
     )
-    simulated = simulate(description, plan, skin)
-    if snr_db is not None:
-        simulated = with_noise(simulated, snr_db, "change")
-    return measure(simulated, seed_set, number, noise)
+    return measure(simulate(description, plan, skin), seed_set, number, noise, snr_db)

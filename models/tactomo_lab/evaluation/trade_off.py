@@ -18,7 +18,7 @@ from tactomo_models.methods.registry import BUDGETED
 from tactomo_models.reconstruct import DEFAULT_BUDGET_S
 
 from tactomo_lab.evaluation.play import Outcome, Variant
-from tactomo_lab.scenes.measures import Score, Summary, summarise
+from tactomo_lab.scenes.measures import Summary, summarise_by
 
 SceneKind = Literal["still", "moving"]
 
@@ -51,12 +51,13 @@ class Point:
 
 def points_of(outcomes: Iterable[Outcome]) -> list[Point]:
     """What became of cases, one point for each kind of scene, ratio and variant."""
-    scores: dict[tuple[SceneKind, float, Variant], list[Score]] = {}
-    for outcome in outcomes:
+
+    def key(outcome: Outcome) -> tuple[SceneKind, float, Variant]:
         kind: SceneKind = "still" if outcome.case.is_still else "moving"
-        of = (kind, outcome.score.snr_db, outcome.variant)
-        scores.setdefault(of, []).append(outcome.score)
-    return [Point(*of, summarise(own)) for of, own in scores.items()]
+        return kind, outcome.score.snr_db, outcome.variant
+
+    found = summarise_by((key(outcome), outcome.score) for outcome in outcomes)
+    return [Point(*of, summary) for of, summary in found.items()]
 
 
 def panels(points: Iterable[Point]) -> Iterator[list[Point]]:

@@ -268,6 +268,7 @@ def measure(
     seed_set: str,
     number: int,
     noise: np.random.SeedSequence,
+    snr_db: float | None = None,  # of the change; the plan's ratio if None
     *,
     is_tare_drawn_first: bool = True,
 ) -> Case:
@@ -277,6 +278,8 @@ def measure(
     those of the scan before those of the `REFERENCE_SCANS` that the tare averages.
     """
     plan, volts, rng = simulated.plan, simulated.volts, np.random.default_rng(noise)
+    if snr_db is not None:
+        plan = replace(plan, snr_db=snr_db, snr_of="change")
     count = len(plan.frames)
     rest, scans, stds = {}, {}, noise_stds(volts, plan.snr_db, plan.snr_of)
     for name in simulated.told.channels:
@@ -313,8 +316,3 @@ def measure(
         Reference.from_scans(*map(rest.get, Channel)),
         frames,
     )
-
-
-def with_noise(simulated: Simulated, snr_db: float, snr_of: SnrOf) -> Simulated:
-    """The same with another noise."""
-    return replace(simulated, plan=replace(simulated.plan, snr_db=snr_db, snr_of=snr_of))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,8 @@ from tactomo_models.sensor.description import SensorDescription
 from tactomo_lab.scenes.case import Case, Frame
 from tactomo_lab.scenes.drawing import PRESSURE_KPA, gap_m
 from tactomo_lab.scenes.simulation import TrueContact
+
+Key = TypeVar("Key")
 
 MATCH_M = 0.012  # centres farther apart belong to different contacts
 BAD_ICC = 0.7  # one that correlates less should have been flagged
@@ -203,6 +205,8 @@ def score(
     groups = touching(frame.presses)
     contacts = dict(zip(frame.presses, truth.contacts, strict=True))
     alone = {group[0]: contacts[group[0]] for group in groups if len(group) == 1}
+    of_contacts = list(alone.values())
+    taken = {there: made.contacts[here] for here, there in match(made.contacts, of_contacts)}
     of_map = _likeness(made.map, truth.map, bool(lost))
     has_structure = case.description.structure is not None
     of_shape = _likeness(made.structure, truth.pressed, bool(lost) or not has_structure)
@@ -211,7 +215,10 @@ def score(
     return Score(
         scene=case.name,
         phase=frame.phase,
-        contacts=score_contacts(case.description, list(alone.values()), made.contacts),
+        contacts=tuple(
+            score_contact(case.description, each, taken.get(index))
+            for index, each in enumerate(of_contacts)
+        ),
         found=len(made.contacts),
         groups=len(groups),
         countable=frame.countable and not lost,
@@ -264,16 +271,6 @@ def _switches(
         switched += known.get(names[there], given) != given
         known[names[there]] = given
     return switched
-
-
-def score_contacts(
-    description: SensorDescription, true: Sequence[TrueContact], found: Sequence[Contact]
-) -> tuple[ContactScore, ...]:
-    """Compare each true contact with the one that is taken for it."""
-    taken = {there: found[here] for here, there in match(found, true)}
-    return tuple(
-        score_contact(description, each, taken.get(index)) for index, each in enumerate(true)
-    )
 
 
 def score_contact(
@@ -409,6 +406,14 @@ def summarise(scores: Sequence[Score]) -> Summary:
         seconds=percentile(seconds, 50),
         seconds_99=percentile(seconds, 99),
     )
+
+
+def summarise_by(scores: Iterable[tuple[Key, Score]]) -> dict[Key, Summary]:
+    """Sum up scores by the key of each, in the order in which keys come first."""
+    of: dict[Key, list[Score]] = {}
+    for key, one in scores:
+        of.setdefault(key, []).append(one)
+    return {key: summarise(own) for key, own in of.items()}
 
 
 def _share_within_one(errors: Sequence[float]) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from tactomo_models.scene.press import Press
 from tactomo_models.sensor.description import SensorDescription
 
-from tactomo_lab.scenes.case import Case, Plan, measure, simulate, with_noise
+from tactomo_lab.scenes.case import Case, Plan, measure, simulate
 from tactomo_lab.scenes.drawing import (
     GAP_M,
     SHAPES,
@@ -42,8 +42,7 @@ def still_case(
     numbers = len(plan.frames[-1]), number
     simulated = simulate(description, plan, seed_of(seed_set, "sheet", *numbers))
     noise = seed_of(seed_set, "noise", *numbers)
-    simulated = with_noise(simulated, snr_db, "change")
-    return measure(simulated, seed_set, number, noise, is_tare_drawn_first=False)
+    return measure(simulated, seed_set, number, noise, snr_db, is_tare_drawn_first=False)
 
 
 def draw_still(

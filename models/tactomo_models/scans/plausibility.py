@@ -22,13 +22,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import Protocol
+from typing import TypeAlias
 
 import numpy as np
 
-from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.robust import robust_sigma
-from tactomo_models.sensor.pattern import Pairs, reciprocal_pairs, rim_signs
+from tactomo_models.sensor.description import SensorDescription
+from tactomo_models.sensor.pattern import PatternLayout, reciprocal_pairs, rim_signs
+
+Layout: TypeAlias = SensorDescription | PatternLayout
+"""Which electrodes every voltage is of: a sensor's description, or a pattern alone."""
 
 TINY = float(np.finfo(float).tiny)
 LARGEST = 1e3  # times the largest voltage expected: more is no voltage of this sheet
@@ -87,25 +91,6 @@ class Verdict:
     usable: BoolArray  # (M,) voltages that may be believed
     flags: Flag  # what is wrong
     electrodes: tuple[int, ...] = ()  # those whose voltages were left out
-
-
-class Layout(Protocol):
-    """Which electrodes every voltage is of: a sensor's description, or a pattern alone."""
-
-    @property
-    def pairs(self) -> Pairs:
-        """Drive and measuring pairs of every voltage."""
-        ...
-
-    @property
-    def electrode_count(self) -> int:
-        """Number of electrodes."""
-        ...
-
-    @property
-    def rim_order(self) -> IntArray:
-        """Place of each electrode round the outer rim, from 0, (electrodes,); -1 elsewhere."""
-        ...
 
 
 class Wiring:

@@ -7,20 +7,16 @@ measuring pairs ascend from 0 or, *rotated*, from the drive's own (EIDORS calls 
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Final, NamedTuple, Self
 
 import numpy as np
 from pydantic import ValidationError
 
-from tactomo_models.arrays import FloatArray, IntArray
+from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.errors import DataError, DescriptionError, explain
 from tactomo_models.sensor.description import SensorDescription
-from tactomo_models.sensor.pattern import (
-    PatternLayout,
-    pattern_of_zeros,
-    reciprocal_pairs,
-    scan_pairs,
-)
+from tactomo_models.sensor.pattern import PatternLayout, reciprocal_pairs, scan_pairs
 
 ROTATED: Final = "rotated"
 MIN_ELECTRODES: Final = 6
@@ -120,13 +116,9 @@ def fitting_patterns(scans: FloatArray) -> list[NamedPattern]:
     """
     count = scans.shape[1]
     root = round(np.sqrt(count))
-    if root * root == count and (scans == 0).all(axis=0).any():
-        try:
-            layout = pattern_of_zeros(scans)
-        except DataError:
-            return []
-        drive, measure = (p[0, 1] - p[0, 0] for p in (layout.pairs.drive, layout.pairs.measure))
-        return [NamedPattern(root, int(drive % root), int(measure % root))]
+    zero = (scans == 0).all(axis=0)
+    if root * root == count and zero.any():
+        return _patterns_of_zeros(zero.reshape(root, root))
     mean = scans.mean(axis=0)
     tried, other = [], []
     for electrodes in range(MIN_ELECTRODES, MAX_ELECTRODES + 1):
@@ -145,3 +137,19 @@ def fitting_patterns(scans: FloatArray) -> list[NamedPattern]:
                     tried.append((float(asymmetry), named))
     least = min((asymmetry for asymmetry, _ in tried), default=0.0)
     return [named for asymmetry, named in tried if asymmetry <= BEST * least] + other
+
+
+def _patterns_of_zeros(zero: BoolArray) -> list[NamedPattern]:
+    """The pattern of a device that reads every measuring pair in every drive; none if unclear.
+
+    `zero` (drives, pairs) is where a pair touches a driven electrode: where the pair's number less
+    the drive's is 0, the drive offset, minus the measuring offset, or their difference.
+    """
+    drives = np.arange(count := len(zero))
+    always = {n for n in range(count) if zero[drives, (drives + n) % count].all()}
+    fits = [
+        NamedPattern(count, drive, measure)
+        for drive, measure in product(range(1, count // 2 + 1), repeat=2)
+        if {0, drive, -measure % count, (drive - measure) % count} == always
+    ]
+    return fits if len(fits) == 1 else []

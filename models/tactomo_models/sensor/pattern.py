@@ -1,12 +1,10 @@
 """Which electrodes drive and which measure: the order of the voltages in a scan."""
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
 
-from tactomo_models.arrays import BoolArray, FloatArray, IntArray
-from tactomo_models.errors import DataError
+from tactomo_models.arrays import BoolArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -82,34 +80,3 @@ class PatternLayout:
     def rim_order(self) -> IntArray:
         """The electrodes are numbered round the rim."""
         return np.arange(self.electrode_count)
-
-
-def pattern_of_zeros(scans: FloatArray) -> PatternLayout:
-    """Read the pattern off scans (T, L * L) of every drive pair by every measuring pair.
-
-    A device that reports all L measuring pairs for each of L drives has 0 where a measuring pair
-    touches a driven electrode: that happens at m - k in {0, drive offset, minus measuring offset,
-    their difference}, which tells both offsets.
-
-    Raises:
-        DataError: the number of voltages is no square, or the zeros do not fit just one pattern.
-    """
-    count = round(np.sqrt(scans.shape[1]))
-    if count * count != scans.shape[1]:
-        raise DataError(
-            f"scans of {scans.shape[1]} voltages are not every drive by every measuring pair; "
-            "give --description or --pattern"
-        )
-    zero = (scans == 0).all(axis=0).reshape(count, count)
-    always = [n for n in range(count) if np.all(zero[range(count), (np.arange(count) + n) % count])]
-    fits = [
-        (drive, measure)
-        for drive, measure in itertools.product(range(1, count // 2 + 1), repeat=2)
-        if {0, drive, -measure % count, (drive - measure) % count} == set(always)
-    ]
-    if len(fits) != 1:
-        raise DataError(
-            f"the zeros of these {count} x {count} voltages fit {len(fits)} patterns of drive and "
-            "measuring pairs; give --description or --pattern"
-        )
-    return PatternLayout(scan_pairs(count, *fits[0]), count)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tactomo_lab.scenes.case import Case, SnrOf, measure, simulate, with_noise
+from tactomo_lab.scenes.case import Case, SnrOf, measure, simulate
 from tactomo_lab.scenes.drawing import (
     BOTH_CHANNELS,
     GAP_M,
@@ -160,7 +161,8 @@ def one(paper: SensorDescription, snr_db: float = 40, snr_of: SnrOf = "change") 
     plan = draw_still(paper, "tuning", 2, 0)
     simulated = simulate(paper, plan, seed_of("tuning", "sheet", 2, 0))
     noise = seed_of("tuning", "noise", 2, 0)
-    return measure(with_noise(simulated, snr_db, snr_of), "tuning", 0, noise)
+    noisy = replace(simulated, plan=replace(plan, snr_db=snr_db, snr_of=snr_of))
+    return measure(noisy, "tuning", 0, noise)
 
 
 def scan_of(case: Case) -> FloatArray:

@@ -9,7 +9,6 @@ import pytest
 from tactomo_lab.evaluation import paper as figures
 from tactomo_lab.evaluation.paper import (
     CASE_KPA,
-    cells,
     image_mass,
     image_of,
     locate,
@@ -17,6 +16,7 @@ from tactomo_lab.evaluation.paper import (
     magnitude_estimate,
     paper_scenes,
     places,
+    points_of,
     pressed_in_turn,
     single_areas,
 )
@@ -58,10 +58,10 @@ def test_scenes_of_the_simulation_study(small: SensorDescription) -> None:
         np.testing.assert_array_equal(scene.tare.magnitude, drawn[0].tare.magnitude)
         assert scene.description.magnitude is not None
         assert scene.description.magnitude.response.sign == -1
-    points = cells(play(drawn[:2], "tikhonov", "noser"))
-    ways = [(p.method, p.contacts) for p in points]
+    points = points_of(play(drawn[:2], "tikhonov", "noser"))
+    ways = [(method, contacts) for method, _, contacts in points]
     assert ways == [("tikhonov", 1), ("noser", 1), ("tikhonov", 2), ("noser", 2)]
-    assert all(point.summary.icc > 0.3 for point in points)
+    assert all(summary.icc > 0.3 for summary in points.values())
 
 
 def test_a_rig_measures_one_uneven_sensor(

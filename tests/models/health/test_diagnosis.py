@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-
 import numpy as np
 import pytest
 import shared_data
@@ -16,7 +14,8 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.health.diagnosis import Diagnosis, diagnose
 from tactomo_models.health.examination import noise_about_line
 from tactomo_models.health.findings import Finding, Level
-from tactomo_models.sensor.pattern import PatternLayout, pattern_of_zeros, scan_pairs
+from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
+from tactomo_models.sensor.pattern import PatternLayout, scan_pairs
 from tactomo_protocol import Channel
 
 SCANS = 60
@@ -219,19 +218,9 @@ def test_a_pattern_is_read_off_its_zeros(electrodes: int, drive: int, measure: i
     full = np.zeros((2, electrodes, electrodes))
     full[:, pairs.drive[:, 0], pairs.measure[:, 0]] = 1 + np.arange(len(pairs.drive))
     scans = full.reshape(2, -1)
-    if (drive, measure) != (1, 1) and electrodes < 13:  # several patterns may have the same zeros
-        with contextlib.suppress(DataError):
-            pattern_of_zeros(scans)
-        return
-    layout = pattern_of_zeros(scans)
-    np.testing.assert_array_equal(layout.pairs.drive, pairs.drive)
-    np.testing.assert_array_equal(layout.pairs.measure, pairs.measure)
-
-
-@pytest.mark.parametrize("scans", [np.ones((2, 256)), np.ones((2, 255))])
-def test_no_pattern_is_guessed(scans: FloatArray) -> None:
-    with pytest.raises(DataError, match="--description or --pattern"):
-        pattern_of_zeros(scans)
+    found = fitting_patterns(scans)
+    if (drive, measure) == (1, 1) or electrodes >= 13 or found:
+        assert found == [NamedPattern(electrodes, drive, measure)]
 
 
 def test_noise_is_not_drift() -> None:
@@ -245,8 +234,9 @@ def test_noise_is_not_drift() -> None:
 def test_the_broken_device_is_broken() -> None:
     with np.load(shared_data.measured("skin_bad_device_32el.npz")) as file:
         scans = file["baseline"].astype(float)
-    layout = pattern_of_zeros(scans)
-    assert layout.electrode_count == 32
+    [named] = fitting_patterns(scans)
+    assert str(named) == "32:adjacent"
+    layout = named.layout
     pairs = layout.pairs
     found = diagnose(layout, scans[:, pairs.drive[:, 0] * 32 + pairs.measure[:, 0]])
     assert found.level == Level.BROKEN
