@@ -7,7 +7,7 @@ in one file.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
@@ -44,27 +44,17 @@ MAX_PORTS = 2
 _Model = TypeVar("_Model", bound=BaseModel)
 
 
-def _sensor_name(name: str) -> str:
-    try:
-        return check_sensor_name(name)
-    except MessageError as error:
-        raise ValueError(error.next_step) from error
+def _found_by(find: Callable[[str], object]) -> AfterValidator:
+    """Refuse a name that leads to nothing, with the reason."""
 
+    def check(name: str) -> str:
+        try:
+            find(name)
+        except (MessageError, MethodError, ConfigError) as error:
+            raise ValueError(str(error)) from error
+        return name
 
-def _method(name: str) -> str:
-    try:
-        find_method(name)
-    except MethodError as error:
-        raise ValueError(str(error)) from error
-    return name
-
-
-def _protocol(name: str) -> str:
-    try:
-        find_protocol(name)
-    except ConfigError as error:
-        raise ValueError(f"{error.cause}; {error.next_step}") from error
-    return name
+    return AfterValidator(check)
 
 
 def _path(path: Any) -> Any:
@@ -75,8 +65,8 @@ def _path(path: Any) -> Any:
 
 FilePath = Annotated[Path, BeforeValidator(_path)]
 Endpoint = Annotated[str, AfterValidator(check_endpoint)]
-MethodName = Annotated[str, AfterValidator(_method)]
-ProtocolName = Annotated[str, AfterValidator(_protocol)]
+MethodName = Annotated[str, _found_by(find_method)]
+ProtocolName = Annotated[str, _found_by(find_protocol)]
 DeviceId = Annotated[str, Field(min_length=1, max_length=64)]
 MetricsAddress = Annotated[str, AfterValidator(check_metrics_address)]
 BudgetMs = Annotated[float, Field(ge=0.01, le=10_000)]
@@ -133,7 +123,7 @@ class DaemonConfig(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """What one daemon serves: one sensor, read over one port or two."""
 
     # This sensor's name in every topic, such as ``left_forearm``
-    name: Annotated[str, AfterValidator(_sensor_name)] = "skin"
+    name: Annotated[str, _found_by(check_sensor_name)] = "skin"
     # A shipped sensor description's name, or the path of a TOML file
     description: Annotated[str, BeforeValidator(_path)] = "paper_square"
     # Of pressure, by `tactomo calibrate`; None for the sensor's own, where there is one

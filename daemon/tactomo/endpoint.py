@@ -136,7 +136,7 @@ def bind(
         if error.errno == zmq.EADDRINUSE:
             raise AddressError(
                 f"{endpoint} ({purpose}) is in use",
-                f"stop the daemon that runs already, or give another address: {option} "
+                f"stop the program that runs already, or give another address: {option} "
                 + (next_address(endpoint) if endpoint.startswith("tcp:") else "ipc://PATH"),
                 "address_in_use",
             ) from error

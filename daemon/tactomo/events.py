@@ -80,6 +80,18 @@ class RateLimit:
         return True
 
 
+class Rises:
+    """Tells which counts have risen since it was asked last; for use by one thread."""
+
+    def __init__(self) -> None:
+        self._seen: dict[str, int] = {}
+
+    def __call__(self, name: str, count: int) -> bool:
+        """Whether the count of that name, now at this, has risen."""
+        before, self._seen[name] = self._seen.get(name, 0), count
+        return count > before
+
+
 class EventBook:
     """Says what is to be told, counts that by name, and keeps the last troubles.
 

@@ -8,8 +8,14 @@ an event or a future, never by setting an attribute. Where that is not so, a com
 from __future__ import annotations
 
 import contextlib
+import queue
 import socket
 import threading
+from collections.abc import Callable
+from concurrent.futures import Future, InvalidStateError
+from typing import Any
+
+from tactomo.errors import TactomoError
 
 
 class Worker:
@@ -28,6 +34,7 @@ class Worker:
         self.turns = 0  # how often the thread went round its loop; the watchdog goes by them
         self._join_s = join_s
         self._stopping = threading.Event()
+        self._asked: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
         # A thread that may hang for ever must not keep the process from ending.
         self._thread = threading.Thread(target=self._run, name=name, daemon=join_s is not None)
 
@@ -47,6 +54,23 @@ class Worker:
     def is_alive(self) -> bool:
         """Whether the thread runs."""
         return self._thread.is_alive()
+
+    def _ask(self, work: Callable[[], Any]) -> Future[Any]:
+        """Have the thread do something between its turns; for any thread, and never waits."""
+        answer: Future[Any] = Future()
+        self._asked.put((work, answer))
+        self._wake()
+        return answer
+
+    def _do_asked(self) -> None:
+        """Do what was asked for. A TactomoError is for who asked; any other ends the thread."""
+        while not self._asked.empty():
+            work, answer = self._asked.get()
+            with contextlib.suppress(InvalidStateError):  # nobody waits for it any more
+                try:
+                    answer.set_result(work())
+                except TactomoError as error:
+                    answer.set_exception(error)
 
     def _run(self) -> None:
         raise NotImplementedError

@@ -27,9 +27,11 @@ from typing import IO
 class ClientError(Exception):
     """Anything this package raises on purpose."""
 
-    def __init__(self, cause: str, next_step: str = "", name: str = "client_error") -> None:
+    name = "client_error"  #: a short stable identifier such as ``no_answer``, for programs
+
+    def __init__(self, cause: str, next_step: str = "", name: str = "") -> None:
         super().__init__(f"{cause}; {next_step}" if next_step else cause)
-        self.name = name  #: a short stable identifier such as ``no_answer``, for programs
+        self.name = name or type(self).name
         self.cause = cause  #: what went wrong, for people
         self.next_step = next_step  #: what to do about it, for people; may be empty
 
@@ -37,8 +39,10 @@ class ClientError(Exception):
 class MessageError(ClientError, ValueError):
     """Bytes that are not a message of this schema, or values that cannot become one."""
 
+    name = "malformed_message"
+
     def __init__(self, cause: str, next_step: str = "compare it with STREAM.md") -> None:
-        super().__init__(cause, next_step, name="malformed_message")
+        super().__init__(cause, next_step)
 
 
 class ControlError(ClientError):
@@ -107,22 +111,19 @@ def control_error(cause: str, next_step: str, name: str) -> ControlError:
 class StreamTimeout(ClientError, TimeoutError):  # noqa: N818 - named for what happened
     """No frame within the time the caller allowed."""
 
-    def __init__(self, cause: str, next_step: str = "") -> None:
-        super().__init__(cause, next_step, name="stream_timeout")
+    name = "stream_timeout"
 
 
 class KeysError(ClientError):
     """Keys that cannot be used, or that a server does not let in; `name` says which."""
 
-    def __init__(self, cause: str, next_step: str = "", name: str = "bad_keys") -> None:
-        super().__init__(cause, next_step, name)
+    name = "bad_keys"
 
 
 class RecordingError(ClientError):
     """A recording that cannot be read; `name` is ``no_frames`` where it holds no frames."""
 
-    def __init__(self, cause: str, next_step: str = "", name: str = "bad_recording") -> None:
-        super().__init__(cause, next_step, name)
+    name = "bad_recording"
 
 
 def checked_seconds(

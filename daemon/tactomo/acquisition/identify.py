@@ -7,7 +7,6 @@ that sends all the same is known by what it sends; one that waits to be started 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import Final
 
 from tactomo_protocol import Command, CommandCode, Decoder, Hello, encode
@@ -21,26 +20,21 @@ ASK_AGAIN_S: Final = 0.5
 _REMEMBERED: Final = 65_536  # bytes; several frames of any protocol
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """What came of asking: a hello, or in words why there is none."""
+def identify(path: str, baud: int, patience_s: float = PATIENCE_S) -> Hello | str:
+    """Open a port, ask for a hello for a bounded time, and close the port; raises nothing.
 
-    hello: Hello | None
-    problem: str = ""
-
-
-def identify(path: str, baud: int, patience_s: float = PATIENCE_S) -> Answer:
-    """Open a port, ask for a hello for a bounded time, and close the port; raises nothing."""
+    Returns the hello, or in words why there is none.
+    """
     connection = Connection(path, baud, lambda *_: None)
     if not connection.try_open():
-        return Answer(None, connection.problem)
+        return connection.problem
     try:
         return _converse(connection, baud, patience_s)
     finally:
         connection.close()
 
 
-def _converse(connection: Connection, baud: int, patience_s: float) -> Answer:
+def _converse(connection: Connection, baud: int, patience_s: float) -> Hello | str:
     decoder, received = Decoder(), b""
     end_s, ask_s = time.monotonic() + patience_s, 0.0
     while connection.is_open and (now_s := time.monotonic()) < end_s:
@@ -51,8 +45,8 @@ def _converse(connection: Connection, baud: int, patience_s: float) -> Answer:
         received = (received + data)[-_REMEMBERED:]
         for packet in decoder.feed(data):
             if isinstance(packet, Hello):
-                return Answer(packet)
-    return Answer(None, connection.problem or _silence(received, decoder.counts.packets, baud))
+                return packet
+    return connection.problem or _silence(received, decoder.counts.packets, baud)
 
 
 def _silence(received: bytes, packets: int, baud: int) -> str:

@@ -35,12 +35,11 @@ from tactomo.acquisition.device_clock import MAX_RATE, ClockState, DeviceClock
 from tactomo.acquisition.liveness import DeviceState, Liveness
 from tactomo.acquisition.open_serial import other_holders
 from tactomo.acquisition.replay_source import ReplaySource
-from tactomo.events import OnEvent, times
+from tactomo.events import OnEvent, Rises, times
 from tactomo.protocols import PortProtocol, Trouble
 from tactomo.recordings.active_recording import ActiveRecording
 from tactomo.recordings.playback import Playback
 from tactomo.recordings.recorder import Recorder
-from tactomo.recordings.recording import REPLAY_SCHEME
 from tactomo.recordings.recording_writer import port_entry, preamble_entry
 from tactomo.scans import ChannelScan, Delivery
 from tactomo.timing import wall_clock_ns
@@ -109,9 +108,9 @@ class PortReader(Worker):
         self._deliver = deliver
         self._on_event = on_event
         self._carriers = {} if carriers is None else carriers
-        self._is_replay = url.startswith(f"{REPLAY_SCHEME}://")
+        self._is_replay = playback is not None
         self.connection = (
-            ReplaySource(url, playback) if self._is_replay else Connection(url, baud, on_event)
+            Connection(url, baud, on_event) if playback is None else ReplaySource(url, playback)
         )
         self._liveness = Liveness(protocol.says_hello, protocol.patience_s)
         self.protocol = protocol
@@ -122,13 +121,11 @@ class PortReader(Worker):
         self._is_doubled = False  # another port carries its channels
         self._asked_s = 0.0  # when the device was last asked, or last sent a scan
         self._trouble_of_protocol: Trouble | None = None
-        self._corrupt_seen = 0
+        self._has_risen = Rises()
         self._judged: DeviceState | None = None  # when sharers were last looked for
         self._sharers = ""
-        self._clock_seen = (self.clock.state, 0)
         self._is_zeroing = threading.Event()
         self._fault, self._fault_s = "", 0.0  # what was last against the protocol, and when
-        self._faulty_seen = 0
         self._unanswered_s: float | None = None  # since when no command has been acknowledged
 
     @property
@@ -205,11 +202,11 @@ class PortReader(Worker):
         self._companions.forget()
         self.protocol.restart()
         self._liveness.opened(time.monotonic())
-        self._ask()
+        self._introduce()
 
     def _attend(self, now_s: float) -> None:
         if now_s - self._asked_s > self._ask_after_s:
-            self._ask()
+            self._introduce()
         if self._is_zeroing.is_set():
             self._is_zeroing.clear()
             self._send(self.protocol.zero_counters())
@@ -231,7 +228,7 @@ class PortReader(Worker):
         if self.connection.try_open():
             self.reopened += 1
             self._liveness.reopened(time.monotonic())
-            self._ask()
+            self._introduce()
 
     def _take(self, data: bytes, realtime_ns: int, monotonic_ns: int, clock_ns: int) -> None:
         self.bytes_read += len(data)
@@ -414,7 +411,7 @@ class PortReader(Worker):
         """Whether its channels are its own beside this device: it did not move from here."""
         return self.is_open or self.hello is None or self.hello.device_id != device_id
 
-    def _ask(self) -> None:
+    def _introduce(self) -> None:
         self._asked_s = time.monotonic()
         self._send(self.protocol.introduction())
 
@@ -482,19 +479,18 @@ class PortReader(Worker):
         self._companions.forget()
         self.protocol.restart()
         self.clock = DeviceClock()
-        self._clock_seen = (self.clock.state, 0)
 
     def _tell_clock(self) -> None:
         """Tell of a device's clock that jumped or is none; scans are dated by arrival then."""
-        clock, (state, jumps) = self.clock, self._clock_seen
-        if clock.jumps > jumps:
+        clock = self.clock
+        if self._has_risen("jumps", clock.jumps):
             self._tell(
                 "device_clock_jumped",
                 f"the device's clock jumped, or the device was reset; "
                 f"{times(clock.jumps)} since the start",
                 "if this event repeats, check the device's supply and timer",
             )
-        if clock.state is not state and clock.state is ClockState.UNUSABLE:
+        if self._has_risen("unusable", clock.state is ClockState.UNUSABLE):
             self._tell(
                 "device_clock_unusable",
                 f"the device's clock stands still, or is off by more than "
@@ -503,7 +499,6 @@ class PortReader(Worker):
                 "correct the firmware's clock: one for both channels, in microseconds, read at the "
                 "start of the scan",
             )
-        self._clock_seen = (clock.state, clock.jumps)
 
     def _tell_protocols_trouble(self) -> None:
         """Tell why nothing can be made of what comes, and when it can again."""
@@ -521,19 +516,16 @@ class PortReader(Worker):
 
     def _tell_corrupt(self) -> None:
         corrupt = self.protocol.counts.damaged
-        if corrupt > self._corrupt_seen:
+        if self._has_risen("corrupt", corrupt):
             self._tell(
                 "corrupt_packets",
                 f"{corrupt} damaged since the start",
                 "check the cable, its shield and the baud rate",
             )
-        self._corrupt_seen = corrupt
 
     def _tell_faulty(self, now_s: float) -> None:
-        faulty = self.protocol.counts.faulty
-        if faulty > self._faulty_seen and self.protocol.fault:
+        if self._has_risen("faulty", self.protocol.counts.faulty) and self.protocol.fault:
             self._note_fault(self.protocol.fault, now_s)
-        self._faulty_seen = faulty
 
 
 def unlike_hello(scan: Scan, hello: Hello) -> str:

@@ -24,14 +24,13 @@ from tactomo.recordings.replay import parse_replay_url
 class ReplaySource:
     """A recorded port, to be used as a `Connection` is."""
 
-    def __init__(self, url: str, playback: Playback | None) -> None:
+    def __init__(self, url: str, playback: Playback) -> None:
         self.is_open = self.has_ended = False
         self.problem = ""
         self.moved = 0  # how often what comes next has not gone on from what came before
         self.latency_timer_ms: int | None = None
         self._url = url
-        self._given = playback  # the replay's time; None for one of its own
-        self._playback: Playback
+        self._playback = playback  # the replay's time
         self._recording: Recording
         self._number = 0
         self._clock_ns = 0
@@ -40,9 +39,7 @@ class ReplaySource:
 
     def open(self) -> None:
         """Open the recording; raise PortError or RecordingError where that cannot be done."""
-        self._recording, self._number, speed = parse_replay_url(self._url)
-        own = Playback(self._recording.start_ns, self._recording.end_ns, speed)
-        self._playback = self._given or own
+        self._recording, self._number, _ = parse_replay_url(self._url)
         self._read_from(0)
         self.is_open = True
 

@@ -77,11 +77,6 @@ class ScanPairer:
         """When `advance` will next have something to return; None when nothing waits."""
         return None
 
-    @property
-    def waiting(self) -> int:
-        """How many scans wait for their partner, or their turn."""
-        raise NotImplementedError
-
 
 class _Instant(NamedTuple):
     """What the scans of one instant have in common."""
@@ -161,11 +156,6 @@ class CounterPairer(ScanPairer):
         """When `advance` will next have something to return; None when nothing waits."""
         oldest = next(iter(self._waiting.values()), None)
         return None if oldest is None else oldest.clock_ns + self._wait_ns
-
-    @property
-    def waiting(self) -> int:
-        """How many scans wait for their partner."""
-        return len(self._waiting)
 
     def _is_new(self, scan: ChannelScan) -> bool:
         """Note how far its channel is with this scan; False for one that came before."""
@@ -273,11 +263,6 @@ class MarkPairer(ScanPairer):
         while self._next < len(self._marks):
             ready += self._settle()
         return ready
-
-    @property
-    def waiting(self) -> int:
-        """How many scans wait for their partner, or their turn."""
-        return len(self._arrived)
 
     def _is_settled(self, channel: Channel, index: int) -> bool:
         """Whether the next mark has its scans, or one of `channel` has been passed over."""

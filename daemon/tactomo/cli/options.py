@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -95,20 +93,10 @@ def methods_option(default: str, **settings: Any) -> Any:
     )
 
 
-def _importable_protocol(name: str | None) -> str | None:
-    """Let Python find my_module where the command is run, as it finds a method's."""
-    if name and ":" in name:
-        sys.path.append(os.getcwd())
-    return name
-
-
 def _protocol(default: str = "") -> Any:
     words = f"Protocol of the device: a name, or your own my_module:MyProtocol.{default}"
     return typer.Option(
-        "--protocol",
-        help=words,
-        autocompletion=lambda: _installed("tactomo.protocols"),
-        callback=_importable_protocol,
+        "--protocol", help=words, autocompletion=lambda: _installed("tactomo.protocols")
     )
 
 

@@ -16,7 +16,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from tactomo_models.calibration.calibration_file import PressureCalibration
 from tactomo_models.calibration.taught_skin import TaughtSkin
@@ -26,7 +26,7 @@ from tactomo.acquisition.scan_pairer import CounterPairer, MarkPairer, ScanPaire
 from tactomo.acquisition.skew import Skew
 from tactomo.acquisition.wall_clock import WallClock
 from tactomo.errors import CommandError
-from tactomo.events import OnEvent, RateLimit, times
+from tactomo.events import OnEvent, RateLimit, Rises, times
 from tactomo.imaging.imaging import Imaging
 from tactomo.plain import counted
 from tactomo.recordings.replay import Replay, ReplayClock
@@ -42,14 +42,6 @@ QUEUED_OF_REPLAY: Final = 8
 """Likewise of a replay, which waits for frames that take longer, and does not run ahead of them."""
 ZERO_PERIOD_S: Final = 10.0
 """How often devices are asked to zero their counters, while that does not bring them in step."""
-
-
-class _SyncState(NamedTuple):
-    """What events are told about when it changes."""
-
-    resets: int
-    zeroed: int
-    disordered: int
 
 
 class Pipeline(Worker):
@@ -89,19 +81,16 @@ class Pipeline(Worker):
         # discarded because this thread did not come round to it for seconds.
         self._received: list[Counter[Channel]] = [Counter() for _ in range(ports)]
         self._discarded: Counter[Channel] = Counter()
-        self._used = self._left_out = self._in_hand = self._joined = 0
+        self._joined = self._used = self._left_out = 0
         self._ready: deque[DualScan] = deque()  # to be made into frames now
         self._skipped = 0  # dual scans left out because newer ones had come
-        self._dropped_seen = 0
+        self._has_risen = Rises()
         self._prepared_for: int | None = None  # when the reference of the frames was taken
         self._announced: dict[int, Hello] = {}  # what each port's device says of itself
         self._begun: set[Channel] = set()  # channels that have been in a dual scan
         self._replay_clock = None if replay is None else ReplayClock(ports, replay.is_paced)
         self._deliveries: queue.Queue[Delivery | None] = queue.Queue(
             QUEUED_DELIVERIES if replay is None else QUEUED_OF_REPLAY
-        )
-        self._commands: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = (
-            queue.SimpleQueue()
         )
         self._overflow_lock = threading.Lock()
 
@@ -118,22 +107,23 @@ class Pipeline(Worker):
         return self._skipped + max(self._discarded.values(), default=0)
 
     def tally(self) -> dict[str, int]:
-        """Return what became of every scan that was delivered, each counted; for any thread.
+        """Return what became of every scan that was delivered; for any thread.
 
-        It adds up but for the few scans that change places meanwhile.
+        What is not counted otherwise waits: for its partner, or for its turn.
         """
+        gone = self._gone()
+        gone["dropped"] += self._discarded.total()
+        received = sum(self.received.values())  # last: no more is gone than came
+        return {"received": received, **gone, "waiting": received - sum(gone.values())}
+
+    def _gone(self) -> dict[str, int]:
+        """Return what became of the scans that were joined and wait no more."""
         sync = self.sync
-        # In this order: what moves on meanwhile counts as waiting, which is never less than 0.
-        gone = self._joined + self._discarded.total()
-        received = sum(self.received.values())
-        queued = received - gone
         return {
-            "received": received,
             "used": self._used,
             "late": sync.late,
             "repeated": sync.repeated,
-            "dropped": self._left_out + self._discarded.total() + sync.unmarked,
-            "waiting": queued + sync.waiting + self._in_hand,
+            "dropped": self._left_out + sync.unmarked,
         }
 
     def deliver(self, delivery: Delivery) -> None:
@@ -199,15 +189,14 @@ class Pipeline(Worker):
         while not self._stopping.is_set():
             self.turns += 1
             self.wall_clock.check()
-            before = self._sync_state()
             ready = self._gather()
-            self._tell_changes(before)
+            self._tell_changes()
             self._ready.extend(ready if self._takes_all else self._newest(ready))
             while self._ready and not self._stopping.is_set() and self._is_let_through():
                 self.turns += 1
                 self._process(self._ready.popleft())
-                self._obey_commands()
-            self._obey_commands()
+                self._do_asked()
+            self._do_asked()
             self._imaging.taring.check()
             if self._replay_clock is not None and self._replay_clock.has_ended and not self._ready:
                 if self._replay is not None and self._replay.playback.loops:
@@ -243,23 +232,13 @@ class Pipeline(Worker):
         moved = playback.move(position_s)
         self._replay_clock = ReplayClock(self._ports, self._replay.is_paced)
         self.finished.clear()
-        before, self.sync = self.sync, self._new_sync()
-        left_out = sum(len(dual.scans) for dual in self._ready)
+        self._left_out += self._joined - sum(self._gone().values())
         self._ready.clear()
-        self._in_hand -= left_out
-        self._left_out += before.waiting + left_out
+        before, self.sync = self.sync, self._new_sync()
         self.sync.carry_on(before)
         self.skew = Skew()
         self._imaging.forget()
         return moved
-
-    def _obey_commands(self) -> None:
-        while not self._commands.empty():
-            command, done = self._commands.get()
-            try:
-                done.set_result(command())
-            except CommandError as refusal:
-                done.set_exception(refusal)
 
     def _process(self, dual: DualScan) -> None:
         recorded = dual.mark.timing if dual.mark is not None else None
@@ -268,7 +247,6 @@ class Pipeline(Worker):
         self._imaging.process(dual, timing, self.sync.lost)
         if not self._is_lossless:
             self._imaging.share_processor(self.dropped)
-        self._in_hand -= len(dual.scans)
         self._used += len(dual.scans)
 
     def _begin(self) -> None:
@@ -288,19 +266,15 @@ class Pipeline(Worker):
             delivery = self._deliveries.get(timeout=self._wait_s())
             for _ in range(QUEUED_DELIVERIES):  # what comes meanwhile is for the next turn
                 if delivery is not None:
-                    ready += self._taken_in_hand(self._join(delivery))
+                    ready += self._join(delivery)
                 delivery = self._deliveries.get_nowait()
-            ready += self._taken_in_hand([] if delivery is None else self._join(delivery))
+            ready += [] if delivery is None else self._join(delivery)
         except queue.Empty:
             pass
         if self._replay is None:
-            ready += self._taken_in_hand(self.sync.advance(time.monotonic_ns()))
+            ready += self.sync.advance(time.monotonic_ns())
         self.incomplete += sum(map(self._lacks_a_channel, ready))
         return ready
-
-    def _taken_in_hand(self, duals: list[DualScan]) -> list[DualScan]:
-        self._in_hand += sum(len(dual.scans) for dual in duals)
-        return duals
 
     def _lacks_a_channel(self, dual: DualScan) -> bool:
         """Tell whether one did not come; of two, one begins a little before the other."""
@@ -346,44 +320,36 @@ class Pipeline(Worker):
             self.sync.lost.update(set(self._channels) - announced)
 
     def _newest(self, ready: list[DualScan]) -> list[DualScan]:
-        left_out = sum(len(dual.scans) for dual in ready[:-1])
         self._skipped += max(0, len(ready) - 1)
-        self._in_hand -= left_out
-        self._left_out += left_out
+        self._left_out += sum(len(dual.scans) for dual in ready[:-1])
         taken_ns = self._imaging.taken_ns
-        if taken_ns != self._prepared_for:  # a new reference takes a while to prepare for
-            self._dropped_seen = self.dropped
-            if ready:
-                self._prepared_for = taken_ns
-        if self.dropped > self._dropped_seen:
+        is_prepared = taken_ns == self._prepared_for  # a new reference takes a while
+        if ready:
+            self._prepared_for = taken_ns
+        if self._has_risen("dropped", self.dropped) and is_prepared:
             self._on_event(
                 "scans_dropped",
                 f"{counted(self.dropped, 'dual scan')} left out since the start",
                 "give the daemon more of the processor, or set a faster method or a budget",
             )
-        self._dropped_seen = self.dropped
         return ready[-1:]
 
-    def _sync_state(self) -> _SyncState:
-        sync = self.sync
-        return _SyncState(sync.resets, sync.zeroed, sync.disordered)
-
-    def _tell_changes(self, before: _SyncState) -> None:
-        now = self._sync_state()
+    def _tell_changes(self) -> None:
+        now, has_risen = self.sync, self._has_risen
         self._tell_lost()
-        if now.resets > before.resets:
+        if has_risen("resets", now.resets):
             self._on_event(
                 "device_restarted",
                 "a device was reset: its scan counter and its clock went back; "
                 f"{times(now.resets)} since the start",
                 "check the device's supply; tare again if the device lost its settings",
             )
-        if now.zeroed > before.zeroed:
+        if has_risen("zeroed", now.zeroed):
             self._on_event(
                 "counters_zeroed",
                 f"the scan counter went back, the clock on; {times(now.zeroed)} since the start",
             )
-        if now.disordered > before.disordered:
+        if has_risen("disordered", now.disordered):
             self._on_event(
                 "scans_disordered",
                 f"{now.disordered} scans since the start came after their channel's next ones, and "
@@ -432,12 +398,6 @@ class Pipeline(Worker):
             oldest = self._deliveries.get_nowait()
             if oldest is not None:
                 self._discarded.update(scan.channel for scan in oldest.scans)
-
-    def _ask(self, command: Callable[[], Any]) -> Future[Any]:
-        done: Future[Any] = Future()
-        self._commands.put((command, done))
-        self._wake()
-        return done
 
     def _wake(self) -> None:
         with contextlib.suppress(queue.Full):  # then it is busy, and looks soon

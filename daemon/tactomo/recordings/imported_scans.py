@@ -42,9 +42,9 @@ from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
 from tactomo_models.sensor.pattern import rim_signs, touching
 from tactomo_protocol import Channel, CompanionReading, Hello, Scan, ScanFlag
 
-from tactomo.errors import TactomoError, os_errors_as
+from tactomo.errors import os_errors_as
 from tactomo.protocols.interface import hello_of
-from tactomo.recordings.eit_files import SUFFIX, eit_files, read_eit_files
+from tactomo.recordings.eit_files import SUFFIX, ImportFileError, eit_files, read_eit_files
 from tactomo.scans import MAX_QUADRATURE
 
 # Of times and electrodes' numbers: seconds since 1970 until 2096.
@@ -53,12 +53,6 @@ SLOWEST_HZ, FASTEST_HZ = 1e-3, 1e6  # what a hello can say
 SIGN_SCANS = 4096  # of a longer file, so many tell the signs
 TURNED_ROUND = 0.9  # share of voltages of the wrong sign; under an object few change theirs
 AT_REST = ("reference", "baseline", "rest", "empty", "vh")  # vh: homogeneous, in EIDORS' tutorials
-
-
-class ImportFileError(TactomoError):
-    """A file whose scans cannot be imported."""
-
-    name = "cannot_import"
 
 
 @dataclass(frozen=True)
@@ -158,8 +152,8 @@ def read_scans(
 ) -> Scans:
     """Read the scans of a measurement, the file or files of `load_arrays`.
 
-    Raises ImportFileError, EitFileError or DataError where it cannot be read, is of no layout, or
-    does not fit the sensor.
+    Raises ImportFileError or DataError where it cannot be read, is of no layout, or does not fit
+    the sensor.
     """
     arrays = load_arrays(path)
     path = path if isinstance(path, Path) else path[0]
@@ -219,7 +213,7 @@ def load_arrays(path: Path | Sequence[Path]) -> dict[str, NDArray[Any]]:
 
     Numbers that no instrument reads are none, see `bounded`.
 
-    Raises ImportFileError or EitFileError where it cannot be read, DataError without numbers.
+    Raises ImportFileError where it cannot be read, DataError without numbers.
     """
     given = [path] if isinstance(path, Path) else path
     files = [file for each in given for file in (eit_files(each) if each.is_dir() else [each])]

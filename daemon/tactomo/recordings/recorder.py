@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import contextlib
 import os
-import queue
 import threading
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, InvalidStateError
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -70,9 +69,6 @@ class Recorder(Worker):
         # the newest file that was closed since the start of what is recorded, and its bytes
         self._last: tuple[Path, int] | None = None
         self._next_try_s = self._next_look_s = 0.0
-        self._requests: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = (
-            queue.SimpleQueue()
-        )
         self._woken = threading.Event()
         self._busy_since_s: float | None = None  # None while the thread rests
         self._is_stalled = self._is_dead = False  # as far as the control thread has told
@@ -154,10 +150,7 @@ class Recorder(Worker):
     def _ask(self, work: Callable[[], Any]) -> Future[Any]:
         if self._is_dead:
             raise RecordingError(_DIED, _REPORT, "cannot_write")
-        answer: Future[Any] = Future()
-        self._requests.put((work, answer))
-        self._wake()
-        return answer
+        return super()._ask(lambda: _answered(work))
 
     def _wake(self) -> None:
         self._woken.set()
@@ -170,7 +163,7 @@ class Recorder(Worker):
             self._woken.wait(None if is_idle else FLUSH_S)
             self._woken.clear()
             self._busy_since_s = time.monotonic()
-            self._answer_requests()
+            self._do_asked()
             self._guard(self._write)
             if self._busy_since_s >= self._next_look_s:
                 self._next_look_s = self._busy_since_s + LOOK_S
@@ -179,20 +172,8 @@ class Recorder(Worker):
         self._busy_since_s = time.monotonic()
         with contextlib.suppress(TactomoError):  # nothing runs; or it failed and that was told
             self._end()
-        self._answer_requests()
+        self._do_asked()
         self._busy_since_s = None
-
-    def _answer_requests(self) -> None:
-        while not self._requests.empty():
-            work, answer = self._requests.get()
-            with contextlib.suppress(InvalidStateError):  # nobody waits for it any more
-                try:
-                    answer.set_result(work())
-                except TactomoError as error:
-                    answer.set_exception(error)
-                except Exception as error:  # whoever asked is told, and the thread goes on
-                    reason = _reason(error)
-                    answer.set_exception(RecordingError(reason, _TRY_ELSEWHERE, "cannot_write"))
 
     def _guard(self, work: Callable[[], None]) -> None:
         """Do a part of the work; where it fails the recording ends, and not the thread."""
@@ -431,6 +412,16 @@ def _reason(error: Exception) -> str:
     if not isinstance(error, OSError | TactomoError):
         log.exception("recording_failed")
     return getattr(error, "strerror", None) or str(error) or repr(error)
+
+
+def _answered(work: Callable[[], Any]) -> Any:
+    """Do what was asked for; whatever goes wrong, who asked is told and the thread goes on."""
+    try:
+        return work()
+    except TactomoError:
+        raise
+    except Exception as error:
+        raise RecordingError(_reason(error), _TRY_ELSEWHERE, "cannot_write") from error
 
 
 def _no_room(free: int, reserve: int) -> str:

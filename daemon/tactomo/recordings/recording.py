@@ -12,20 +12,19 @@ lies beyond damage in the middle is for `recovery`.
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import IO, Annotated, Any, Final, NamedTuple
+from typing import IO, Annotated, Any, Final, NamedTuple, TypeVar
 from urllib.parse import quote
 
 import msgpack  # type: ignore[import-untyped]
 from mcap.records import Chunk as McapChunk
 from mcap.records import Footer, McapRecord, Message, Metadata
-from pydantic import BaseModel, Strict, StrictBool, StrictInt, StrictStr
+from pydantic import BaseModel, Field, Strict, StrictBool, StrictInt, StrictStr
 from tactomo_client import MessageError, recording_file
 from tactomo_client.errors import RecordingError as ClientRecordingError
 from tactomo_client.messages import MAX_ENTRIES, array_from_wire
@@ -46,6 +45,7 @@ DRIFT_ARRAYS: Final = tuple(f"{c}_{what}" for what in ("drift", "creep") for c i
 """Missing in recordings of daemons that did not follow drift."""
 REPLAY_SCHEME: Final = "replay"
 GIVE_DESCRIPTION: Final = "give the description's file by --description"
+_Record = TypeVar("_Record", bound=BaseModel)
 PREAMBLE_REACH_NS: Final = 2_000_000_000
 """How long a preamble is of use to a replay that begins after it: those of foreign protocols come
 every second, and one of ours is not needed by a port that knows its device."""
@@ -339,7 +339,9 @@ def _our_errors() -> Iterator[None]:
 
 
 def _read_reference(data: bytes) -> Reference:
-    fields = _fields(data, "scans", *REFERENCE_ARRAYS)
+    record, fields = _read(_Reference, data), _fields(data)
+    if not fields.keys() >= set(REFERENCE_ARRAYS):
+        raise _malformed()
     try:
         arrays = {
             name: None if fields.get(name) is None else array_from_wire(fields[name])
@@ -347,44 +349,36 @@ def _read_reference(data: bytes) -> Reference:
         }
     except MessageError as error:
         raise _malformed() from error
-    return Reference(
-        scans=_integer(fields["scans"]),
-        is_noise_measured=True,
-        companions=_at_rest(fields.get("companions")),
-        **arrays,
-    )
+    at_rest = None if record.companions is None else tuple(record.companions.items())
+    return Reference(scans=record.scans, is_noise_measured=True, companions=at_rest, **arrays)
 
 
-def _at_rest(readings: Any) -> tuple[tuple[str, float], ...] | None:
-    if readings is None:
-        return None
-    if not isinstance(readings, dict) or not all(
-        isinstance(name, str) and isinstance(value, float) and math.isfinite(value)
-        for name, value in readings.items()
-    ):
-        raise _malformed()
-    return tuple(readings.items())
+class _Numbered(BaseModel):
+    number: StrictInt | None = None
+
+
+class _Reference(_Numbered):
+    scans: StrictInt
+    companions: (
+        dict[StrictStr, Annotated[float, Field(strict=True, allow_inf_nan=False)]] | None
+    ) = None
 
 
 def read_reference_number(data: bytes) -> int | None:
     """Return which of its recording's references a message holds; None in old recordings."""
-    number = _fields(data).get("number")
-    return None if number is None else _integer(number)
+    return _read(_Numbered, data).number
 
 
-class KeptCalibration(NamedTuple):
+class KeptCalibration(BaseModel):
     """A pressure calibration that was put in force during a recording."""
 
-    number: int  # which of its recording's, from 1
-    text: str  # of its file; empty for none
+    number: StrictInt  # which of its recording's, from 1
+    text: StrictStr  # of its file; empty for none
 
 
 def read_calibration(data: bytes) -> KeptCalibration:
     """Read a message of the topic ``calibration``; raise RecordingError where it is none."""
-    fields = _fields(data, "number", "text")
-    if not isinstance(fields["text"], str):
-        raise _malformed()
-    return KeptCalibration(_integer(fields["number"]), fields["text"])
+    return _read(KeptCalibration, data)
 
 
 def calibration_text(calibration: PressureCalibration | None) -> str:
@@ -413,8 +407,8 @@ def recorded_calibration(
 
 def read_mark(data: bytes) -> Mark:
     """Read a message of the topic ``frame``; raise RecordingError where it is none."""
+    mark = _read(_Mark, data)
     try:
-        mark = _Mark.model_validate(_fields(data))
         keys = [ScanKey(Channel.of_number(c), counter, device) for c, counter, device in mark.scans]
     except ValueError as error:
         raise _malformed() from error
@@ -441,18 +435,19 @@ class _Mark(BaseModel):
     timing: tuple[StrictInt, StrictBool, StrictInt | None, StrictBool] | None = None
 
 
-def _integer(value: object) -> int:
-    if not isinstance(value, int):
-        raise _malformed()
-    return value
+def _read(kind: type[_Record], data: bytes) -> _Record:
+    try:
+        return kind.model_validate(_fields(data))
+    except ValueError as error:
+        raise _malformed() from error
 
 
-def _fields(data: bytes, *needed: str) -> dict[str, Any]:
+def _fields(data: bytes) -> dict[str, Any]:
     try:
         fields = msgpack.unpackb(data, max_array_len=MAX_ENTRIES, max_map_len=MAX_ENTRIES)
     except Exception as error:  # msgpack raises of many kinds
         raise _malformed() from error
-    if not isinstance(fields, dict) or not fields.keys() >= set(needed):
+    if not isinstance(fields, dict):
         raise _malformed()
     return fields
 

@@ -17,17 +17,12 @@ from tactomo_client.errors import MessageError
 from tactomo_client.messages import MAX_MESSAGE_BYTES, decode_request, encode_error, encode_reply
 
 from tactomo.endpoint import bind, remove_file
-from tactomo.errors import AddressError, CommandError
+from tactomo.errors import CommandError
 from tactomo.stream.commands import Arguments, Nothing, obey
 from tactomo.twin.scene import Indenter, Scene, SkinDriftSettings
 
 Handler = Callable[[Any], Mapping[str, Any]]
 PressId = Annotated[str, Field(min_length=1, max_length=64, coerce_numbers_to_str=True)]
-
-ANOTHER_ADDRESS = (
-    "stop the twin or demo that runs already, or give another address: "
-    "`tactomo twin` and `tactomo demo`: --twin-control"
-)
 
 
 class PressArguments(Indenter):
@@ -101,10 +96,7 @@ class ControlSocket:
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REP)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
-        try:
-            self.address = bind(self._socket, address, "control")
-        except AddressError as error:
-            raise AddressError(error.cause, ANOTHER_ADDRESS, error.name) from error
+        self.address = bind(self._socket, address, "control", option="--twin-control")
 
     @property
     def socket(self) -> zmq.Socket[bytes]:

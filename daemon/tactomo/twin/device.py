@@ -37,6 +37,7 @@ from tactomo.protocols.interface import TWIN_ID, hello_of
 from tactomo.stream.commands import Nothing, explained
 from tactomo.twin.companions import SimulatedCompanions
 from tactomo.twin.control import (
+    COMMANDS,
     ControlSocket,
     GarbageArguments,
     Handler,
@@ -317,20 +318,7 @@ class Twin:
         )
 
     def _handlers(self) -> dict[str, Handler]:
-        return {
-            "status": self._status,
-            "scene": self._scene,
-            "press": self._press,
-            "release": self._release,
-            "clear": self._clear,
-            "play": self._play,
-            "noise": self._set_noise,
-            "drift": self._set_drift,
-            "mute": self._mute,
-            "garbage": self._garbage,
-            "unplug": self._unplug,
-            "replug": self._replug,
-        }
+        return {command: getattr(self, f"_{command}") for command in COMMANDS}
 
     def _status(self, _: Nothing) -> dict[str, Any]:
         firmware = self._firmware
@@ -387,11 +375,11 @@ class Twin:
         self._play_at(self._clock())
         return {"length_s": self._script.length_s}
 
-    def _set_noise(self, arguments: NoiseArguments) -> dict[str, Any]:
+    def _noise(self, arguments: NoiseArguments) -> dict[str, Any]:
         self._converter.noise_v = arguments.noise_v
         return {}
 
-    def _set_drift(self, arguments: SkinDriftSettings) -> dict[str, Any]:
+    def _drift(self, arguments: SkinDriftSettings) -> dict[str, Any]:
         if self._drifting is None:
             raise CommandError(
                 "this twin's skin is not simulated: it does not drift",

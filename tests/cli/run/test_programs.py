@@ -61,7 +61,7 @@ def announced(stream: IO[str] | None) -> dict[str, Any]:
 
 def test_a_twin_whose_control_address_is_taken_says_what_to_do(tactomo: Run, control: Any) -> None:
     result = tactomo("twin", "--link", "dev", "--twin-control", control.address, status=1)
-    assert "is in use; stop the twin or demo that runs already" in result.stderr
+    assert "is in use; stop the program that runs already" in result.stderr
 
 
 @pytest.mark.slow

@@ -261,8 +261,8 @@ def of_arrays(
 ) -> Evidence:
     """Read a file of arrays as `tactomo reconstruct` does; see `tactomo doctor --help`.
 
-    Raises DoctorError, ImportFileError, EitFileError or DataError where it cannot be read or
-    examined, or its scans fit no description or pattern.
+    Raises DoctorError, ImportFileError or DataError where it cannot be read or examined, or its
+    scans fit no description or pattern.
     """
     arrays = load_arrays(path)
     is_batch = array is None and bool(arrays.keys() & set(Channel))

@@ -14,8 +14,10 @@ from tactomo.cli.options import JsonOutput, examples, typer_app
 from tactomo.cli.output import print_json, say
 
 if TYPE_CHECKING:
+    from tactomo_protocol import Hello
+
     from tactomo.acquisition.adapters import Adapter, Holder
-    from tactomo.acquisition.identify import Answer
+
 
 NONE_THERE = """no USB adapter is there
   Plug the skin in and repeat. If it is still missing, try another cable (some only charge),
@@ -99,8 +101,8 @@ def survey(paths: Sequence[str], root: Path = Path("/")) -> list[Row]:
 
 def question(
     paths: Sequence[str], baud: int | None, protocol: str | None = None
-) -> dict[str, Answer]:
-    """Ask all ports at the same time who is there."""
+) -> dict[str, Hello | str]:
+    """Ask all ports at the same time who is there; in words why there is no hello."""
     from concurrent.futures import ThreadPoolExecutor
 
     from tactomo.acquisition.identify import identify
@@ -113,14 +115,14 @@ def question(
         )
 
 
-def as_fields(row: Row, answers: dict[str, Answer]) -> dict[str, Any]:
+def as_fields(row: Row, answers: dict[str, Hello | str]) -> dict[str, Any]:
     """Return a row for programs."""
-    answer = answers.get(row.path)
+    answer = answers.get(row.path) or None
     device = None
-    if answer and answer.hello:
+    if answer is not None and not isinstance(answer, str):
         from tactomo.imaging.frames import device_fields
 
-        device = device_fields(answer.hello)
+        device, answer = device_fields(answer), None
     return {
         "path": row.path,
         "use": row.use or None,
@@ -128,11 +130,11 @@ def as_fields(row: Row, answers: dict[str, Answer]) -> dict[str, Any]:
         "held_by": [{"pid": holder.pid, "command": holder.command} for holder in row.held_by],
         "remarks": row.remarks,
         "device": device,
-        "no_device_because": (answer and answer.problem) or None,
+        "no_device_because": answer,
     }
 
 
-def lines(rows: Sequence[Row], answers: dict[str, Answer]) -> list[str]:
+def lines(rows: Sequence[Row], answers: dict[str, Hello | str]) -> list[str]:
     """Return the rows as lines for people; what is in one can be copied whole."""
     told = []
     for row in rows:
@@ -204,10 +206,9 @@ def _describe(adapter: Adapter | None) -> str:
     return " ".join(filter(None, (adapter.maker, adapter.product, f"({usb})")))
 
 
-def _describe_device(answer: Answer) -> str:
-    hello = answer.hello
-    if hello is None:
-        return answer.problem
+def _describe_device(hello: Hello | str) -> str:
+    if isinstance(hello, str):
+        return hello
     channels = ", ".join(channel for channel in hello.channels)
     rate = f"{hello.scan_rate_hz:g} scans/s" if hello.scan_rate_hz else "triggered"
     return f"{hello.device_id}: {channels}; {rate}; firmware {hello.firmware}"
