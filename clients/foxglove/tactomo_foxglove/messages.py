@@ -16,6 +16,7 @@ import numpy as np
 from foxglove import messages as fox
 from numpy.typing import NDArray
 from tactomo_client import Contact, Frame, appearance
+from tactomo_client.touch import images_of
 
 Pixels = NDArray[np.uint8]
 
@@ -71,18 +72,11 @@ def grid(frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str)
     """
     if description.get("mount"):
         return None
-    pixels, shown = (
-        appearance.map_pixels(frame, description),
-        appearance.shown_image(frame, description),
-    )
+    pixels = appearance.map_pixels(frame, description)
+    shown = appearance.shown_image(frame, description)
     if pixels is None or shown is None or frame.x_mm is None or frame.y_mm is None:
         return None
-    images = [
-        ("pressure_kpa", frame.pressure_kpa),
-        ("magnitude", frame.map),
-        ("structure", frame.structure),
-    ]
-    values = known(images)
+    values = known(images_of(frame).items())
     rows, columns, _ = pixels.shape
     colours = ("red", "green", "blue", "alpha")
     cells = np.zeros((rows, columns), [(n, "u1") for n in colours] + [(n, "<f4") for n in values])

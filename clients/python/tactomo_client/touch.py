@@ -44,11 +44,16 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 CONTACTS: Final = 16  #: rows for contacts; a hand of five fingers, thrice
-IMAGES: Final = {"pressure_kpa": "pressure_kpa", "magnitude": "map", "structure": "structure"}
 CONTACT_COLUMNS: Final = tuple(
     name for name in table_row(Contact(0, 0.0, 0.0, 0.0)) if name != "mount_frame"
 )
 """A contact's numbers; `pressure_range` is its place in `frame.PRESSURE_RANGES`."""
+
+
+def images_of(frame: Frame | None) -> dict[str, NDArray[np.float32] | None]:
+    """Return a frame's images by what they show; None for one that it does not have."""
+    names = {"pressure_kpa": "pressure_kpa", "magnitude": "map", "structure": "structure"}
+    return {name: getattr(frame, of_frame, None) for name, of_frame in names.items()}
 
 
 class Touch:
@@ -87,10 +92,7 @@ class Touch:
             row = [_number(cells[name]) for name in CONTACT_COLUMNS]
             table[trace - 1] = [0.0 if number is None else number for number in row]
             is_number[trace - 1] = [number is not None for number in row]
-        images = {
-            name: self._image(None if frame is None else getattr(frame, of_frame))
-            for name, of_frame in IMAGES.items()
-        }
+        images = {name: self._image(image) for name, image in images_of(frame).items()}
         is_known = frame is not None and frame.is_known
         return {
             **{name: np.nan_to_num(image) for name, image in images.items()},

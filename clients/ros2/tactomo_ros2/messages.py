@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from tactomo_client import Contact, Frame, Status
 from tactomo_client.appearance import surface_nodes, towards
 from tactomo_client.schema import PRESSURE_RANGES, Mount, table_row
-from tactomo_client.touch import CONTACT_COLUMNS
+from tactomo_client.touch import CONTACT_COLUMNS, images_of
 
 TYPES: Final = get_typestore(Stores.ROS2_HUMBLE)
 """Definitions; their hashes are the same up to Kilted and, but for Humble, part of the wire."""
@@ -148,11 +148,7 @@ def _cloud(points: NDArray[np.void], header: Any) -> Any:
 
 def _map_points(frame: Frame, mount: Mount | None) -> NDArray[np.void] | None:
     """Return the sheet's nodes, (ny, nx); None for a frame without images."""
-    images = {
-        "pressure_kpa": frame.pressure_kpa,
-        "magnitude": frame.map,
-        "structure": frame.structure,
-    }
+    images = images_of(frame)
     shape = next((image.shape for image in images.values() if image is not None), None)
     if shape is None or frame.x_mm is None or frame.y_mm is None:
         return None

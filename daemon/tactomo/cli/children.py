@@ -29,12 +29,6 @@ STOP_S = 10.0
 START_S = 180.0
 
 
-class ChildError(TactomoError):
-    """A child process ended by itself, or did not become ready."""
-
-    name = "child_failed"
-
-
 class Child:
     """One running `tactomo` command."""
 
@@ -81,9 +75,9 @@ class Child:
         return self._process.wait()
 
     def wait_ready(self) -> Mapping[str, Any]:
-        """Return what the child announced; raise ChildError where it ended or takes too long."""
+        """Return what the child announced; raise TactomoError where it ended or takes too long."""
         if not self._changed.wait(START_S):
-            raise ChildError(
+            raise TactomoError(
                 f"the {self.name} was not ready after {START_S:g} s", self._last_lines()
             )
         if self._ready is None:
@@ -91,14 +85,14 @@ class Child:
         return self._ready
 
     def wait_done(self) -> None:
-        """Wait until a child that does one thing has done it; raise ChildError where it failed."""
+        """Wait until a child that does one thing has done it; TactomoError where it failed."""
         if self.status != 0:
             self._reader.join()
             raise self.failure()
 
-    def failure(self) -> ChildError:
+    def failure(self) -> TactomoError:
         """Return the error that says how the child ended and what it said last."""
-        return ChildError(
+        return TactomoError(
             f"the {self.name} stopped (exit status {self.status})", self._last_lines()
         )
 

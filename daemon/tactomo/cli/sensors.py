@@ -45,11 +45,6 @@ def find_sensor(name: str | None, address: str | None, keys: Path | None = None)
     )
 
 
-def find_control(name: str | None, address: str | None, keys: Path | None) -> str:
-    """Return the address of the control socket of the sensor that is meant, see `find_sensor`."""
-    return find_commanded(name, address, keys).control
-
-
 def find_commanded(name: str | None, address: str | None, keys: Path | None) -> Running:
     """Return the sensor that is meant, see `find_sensor`, whose control socket is its own."""
     found = find_sensor(name, address, keys)

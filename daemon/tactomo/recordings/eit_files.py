@@ -33,12 +33,6 @@ _DATES: Final = ("%Y.%m.%d. %H:%M:%S.%f", "%Y.%m.%d. %H:%M:%S")
 _ANOTHER: Final = "is it a Sciospec file? Other programs have a format of that name, too"
 
 
-class ImportFileError(TactomoError):
-    """A file whose scans cannot be imported."""
-
-    name = "cannot_import"
-
-
 class _Frame(NamedTuple):
     injection: list[tuple[int, int]]
     volts: NDArray[np.complex128]  # (injections, channels)
@@ -46,10 +40,10 @@ class _Frame(NamedTuple):
 
 
 def eit_files(folder: Path) -> list[Path]:
-    """Return the .eit files in a folder, by name; raise ImportFileError where there is none."""
+    """Return the .eit files in a folder, by name; raise TactomoError where there is none."""
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() == SUFFIX)
     if not found:
-        raise ImportFileError(f"{folder} holds no {SUFFIX} file", "give the folder that has them")
+        raise TactomoError(f"{folder} holds no {SUFFIX} file", "give the folder that has them")
     return found
 
 
@@ -57,13 +51,13 @@ def read_eit_files(paths: Sequence[Path]) -> dict[str, NDArray[Any]]:
     """Return the frames of .eit files in the order of their dates.
 
     `volts` (T, injections, channels) complex, `injection` (injections, 2) from 1, `t` (T,) seconds
-    since 1970, as if the dates in the files were UTC. Raises ImportFileError, which names the line,
+    since 1970, as if the dates in the files were UTC. Raises TactomoError, which names the line,
     where one of them cannot be read, is none, or is of another measurement.
     """
     frames = [_read(path) for path in paths]
     for path, frame in zip(paths, frames, strict=True):
         if frame.injection != frames[0].injection or frame.volts.shape != frames[0].volts.shape:
-            raise ImportFileError(
+            raise TactomoError(
                 f"{path} and {paths[0]} have different injections or channels",
                 "import each measurement by itself",
             )
@@ -78,12 +72,12 @@ def read_eit_files(paths: Sequence[Path]) -> dict[str, NDArray[Any]]:
 def _read(path: Path) -> _Frame:
     step = f"give the path of a {SUFFIX} file"
     try:
-        with os_errors_as(ImportFileError, f"cannot read {path}", step):
+        with os_errors_as(TactomoError, f"cannot read {path}", step):
             text = read_regular(path, MAX_BYTES).decode("ascii").rstrip()
     except UnicodeDecodeError as error:
-        raise ImportFileError(f"{path} is not text", _ANOTHER) from error
+        raise TactomoError(f"{path} is not text", _ANOTHER) from error
     if text.count("\n") > MAX_LINES:
-        raise ImportFileError(f"{path} has more than {MAX_LINES} lines", _ANOTHER)
+        raise TactomoError(f"{path} has more than {MAX_LINES} lines", _ANOTHER)
     return _Lines(path, text.split("\n")).frame()
 
 
@@ -183,5 +177,5 @@ class _Lines:
             raise self._wrong(number, "a value is not a finite number")
         return values.view(np.complex128)
 
-    def _wrong(self, number: int, cause: str, next_step: str = "save it anew") -> ImportFileError:
-        return ImportFileError(f"{self._path}, line {number}: {cause}", next_step)
+    def _wrong(self, number: int, cause: str, next_step: str = "save it anew") -> TactomoError:
+        return TactomoError(f"{self._path}, line {number}: {cause}", next_step)

@@ -42,9 +42,9 @@ from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
 from tactomo_models.sensor.pattern import rim_signs, touching
 from tactomo_protocol import Channel, CompanionReading, Hello, Scan, ScanFlag
 
-from tactomo.errors import os_errors_as
+from tactomo.errors import TactomoError, os_errors_as
 from tactomo.protocols.interface import hello_of
-from tactomo.recordings.eit_files import SUFFIX, ImportFileError, eit_files, read_eit_files
+from tactomo.recordings.eit_files import SUFFIX, eit_files, read_eit_files
 from tactomo.scans import MAX_QUADRATURE
 
 # Of times and electrodes' numbers: seconds since 1970 until 2096.
@@ -75,16 +75,16 @@ class Scans:
         return len(next(iter(self.volts.values())))
 
     def times(self, rate_hz: float | None) -> FloatArray:
-        """Return (T,) seconds from 0, by rate or the file's own; else raise ImportFileError."""
+        """Return (T,) seconds from 0, by rate or the file's own; else raise TactomoError."""
         if rate_hz is not None:
             if not SLOWEST_HZ <= rate_hz <= FASTEST_HZ:
-                raise ImportFileError(
+                raise TactomoError(
                     f"{rate_hz:g} scans a second are no device's",
                     f"give --rate from {SLOWEST_HZ:g} to {FASTEST_HZ:.0f}",
                 )
             return np.arange(self.count) / rate_hz
         if self.time_s is None:
-            raise ImportFileError("the file does not say when its scans were taken", "give --rate")
+            raise TactomoError("the file does not say when its scans were taken", "give --rate")
         return self.time_s
 
     def reference_of(self, frames: slice | None) -> Reference | None:
@@ -106,7 +106,7 @@ class Scans:
         if volts is None:
             return None
         if not len(volts[frames]):
-            raise ImportFileError(
+            raise TactomoError(
                 f"the reference frames are none of the {len(volts)} scans",
                 "name some that are there, such as --reference-frames 0:20",
             )
@@ -152,7 +152,7 @@ def read_scans(
 ) -> Scans:
     """Read the scans of a measurement, the file or files of `load_arrays`.
 
-    Raises ImportFileError or DataError where it cannot be read, is of no layout, or does not fit
+    Raises TactomoError or DataError where it cannot be read, is of no layout, or does not fit
     the sensor.
     """
     arrays = load_arrays(path)
@@ -213,19 +213,19 @@ def load_arrays(path: Path | Sequence[Path]) -> dict[str, NDArray[Any]]:
 
     Numbers that no instrument reads are none, see `bounded`.
 
-    Raises ImportFileError where it cannot be read, DataError without numbers.
+    Raises TactomoError where it cannot be read, DataError without numbers.
     """
     given = [path] if isinstance(path, Path) else path
     files = [file for each in given for file in (eit_files(each) if each.is_dir() else [each])]
     if all(file.suffix.lower() == SUFFIX for file in files):
         return read_eit_files(files)
     if len(files) > 1:
-        raise ImportFileError(
+        raise TactomoError(
             f"{len(files)} files were given, not all of them {SUFFIX}", "give one at a time"
         )
     [one] = files
     step = f"give the path of a file such as .npz, {SUFFIX}, .mat or .csv"
-    with os_errors_as(ImportFileError, f"cannot read {one}", step):
+    with os_errors_as(TactomoError, f"cannot read {one}", step):
         return {name: bounded(array) for name, array in read_arrays(one).items()}
 
 
@@ -236,7 +236,7 @@ def is_single_ended(arrays: Mapping[str, Any]) -> bool:
 
 def _only_channel(description: SensorDescription) -> Channel:
     if len(description.channels) != 1:
-        raise ImportFileError(
+        raise TactomoError(
             f"{description.name} has two channels and the file does not say which this is",
             "give --channel magnitude or --channel structure",
         )
@@ -246,7 +246,7 @@ def _only_channel(description: SensorDescription) -> Channel:
 def _batch(path: Path, arrays: dict[str, NDArray[Any]], description: SensorDescription) -> Scans:
     foreign = sorted(arrays.keys() & set(Channel) - set(description.channels))
     if any(not all_nan(arrays[name]) for name in foreign):
-        raise ImportFileError(
+        raise TactomoError(
             f"{path} holds a channel that {description.name} does not have: {', '.join(foreign)}",
             "give another description with --description",
         )
@@ -283,7 +283,7 @@ def _in_phase(
         raw = raw * np.exp(1j * turn_rad)
     quadrature = _quadrature(raw)
     if quadrature > MAX_QUADRATURE:
-        raise ImportFileError(
+        raise TactomoError(
             f"{path}: the voltages have no common phase: {quadrature:.0%} of the signal stays "
             "out of phase with the current at the best rotation",
             "calibrate the instrument by a resistor, and measure again",
@@ -365,9 +365,9 @@ def _misfit(
 
 def _unlike(
     path: Path, arrays: Mapping[str, NDArray[Any]], cause: str, next_step: str
-) -> ImportFileError:
+) -> TactomoError:
     held = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
-    return ImportFileError(f"{path} holds {held or 'nothing'}: {cause}", next_step)
+    return TactomoError(f"{path} holds {held or 'nothing'}: {cause}", next_step)
 
 
 def _single_ended_arrays(
@@ -377,7 +377,7 @@ def _single_ended_arrays(
     raw, electrodes = arrays["volts"], description.electrode_count
     fits = raw.shape[1:] == (len(injection), electrodes) and raw.size > 0
     if not fits or raw.dtype.kind not in "fciu":
-        raise ImportFileError(
+        raise TactomoError(
             f"{path}: volts is {raw.dtype} {raw.shape}",
             f"it must be numbers (T, {len(injection)}, {electrodes})",
         )
@@ -393,7 +393,7 @@ def _injection_rows(
     wanted = [tuple(pair) for pair in description.pairs.drive.tolist()]
     missing = sorted(set(wanted) - where.keys())
     if missing:
-        raise ImportFileError(
+        raise TactomoError(
             f"{path} has no injection {missing[0]}, which the sensor's pattern needs",
             "give the description of the sensor that was measured",
         )
@@ -406,7 +406,7 @@ def _times(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> FloatA
         return None
     time_s = _checked(path, "t", arrays["t"], (count,))
     if np.any(np.diff(time_s) < 0):
-        raise ImportFileError(
+        raise TactomoError(
             f"{path}: t does not rise", "sort the frames by it, or leave it out and give --rate"
         )
     return np.asarray(time_s - time_s[0])
@@ -417,5 +417,5 @@ def _checked(
 ) -> FloatArray:
     numbers = checked(path, name, array, shape)
     if not numbers.size or not np.all(np.abs(numbers) <= MOST):
-        raise ImportFileError(f"{path}: {name} holds what is out of range", "correct it")
+        raise TactomoError(f"{path}: {name} holds what is out of range", "correct it")
     return numbers

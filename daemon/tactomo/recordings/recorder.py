@@ -365,10 +365,10 @@ class Recorder(Worker):
             kept = list_recordings(self._folder, sensor)
             found = (one if one.path == path else dated(one, sensor) for one in kept)
             ours = [one for one in found if one is not None]
-            for deletion in to_delete(ours, self._rules):
-                deletion.path.unlink()
+            for old, reason in to_delete(ours, self._rules):
+                old.unlink()
                 self.deleted += 1
-                self._on_event("recording_deleted", f"{deletion.path}: {deletion.reason}")
+                self._on_event("recording_deleted", f"{old}: {reason}")
         except OSError as error:  # the next file's beginning tries again
             log.warning("recording_not_deleted", detail=str(error))
 

@@ -30,6 +30,7 @@ class Replay:
     reference: Reference | None  # the one in force at its beginning
     is_paced: bool  # whether bytes come in their own time rather than as fast as they are taken
     playback: Playback  # its time, which the ports share
+    protocol: str  # what the ports speak
     calibration: PressureCalibration | None = None
     """Of pressure, that the daemon had when it began to record."""
     knows_calibration: bool = False
@@ -128,6 +129,7 @@ def read_replay(urls: Sequence[str], description: SensorDescription) -> Replay |
         marks=marks,
         reference=reference,
         is_paced=speed > 0,
+        protocol=recording.origin.protocol,
         playback=Playback(
             recording.start_ns, recording.end_ns, speed, _last_ns(marks), bool(marks)
         ),

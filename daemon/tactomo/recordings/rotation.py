@@ -34,13 +34,6 @@ class KeptRecording(NamedTuple):
     end_s: float  # when the last thing in it was written, likewise; see `dated`
 
 
-class Deletion(NamedTuple):
-    """A file that is to go, and why."""
-
-    path: Path
-    reason: str
-
-
 def next_path(folder: Path, sensor: str, now_s: float) -> Path:
     """Return the path of the next recording; raise OSError where the folder cannot be read."""
     numbers = [kept.number for kept in list_recordings(folder, sensor)]
@@ -71,8 +64,8 @@ def _recordings(folder: Path, sensor: str) -> Iterator[KeptRecording]:
 def to_delete(
     recordings: list[KeptRecording],  # all there are; the last one, which is being written, stays
     rules: RecordingConfig,  # what is to be kept
-) -> list[Deletion]:
-    """Return what has to go, oldest first, so that the newest may grow to its full size."""
+) -> list[tuple[Path, str]]:
+    """Return what has to go and why, oldest first, so that the newest may grow to its full size."""
     *closed, newest = recordings
     ages_s = _ages_s(recordings)
     room = rules.keep_gb * 1e9 - max(newest.size, rules.rotate_mb * 1e6)
@@ -85,7 +78,7 @@ def to_delete(
             reason = f"older than {rules.keep_days:g} days"
         else:
             continue
-        deletions.append(Deletion(kept.path, reason))
+        deletions.append((kept.path, reason))
         total -= kept.size
     return deletions
 

@@ -73,9 +73,9 @@ from tactomo.imaging.kept_reference import KeptReference
 from tactomo.imaging.pipeline import Pipeline
 from tactomo.protocols import find_protocol, protocol_named
 from tactomo.recordings.recorder import Recorder
-from tactomo.recordings.recording import REPLAY_SCHEME, Origin, calibration_text
+from tactomo.recordings.recording import Origin, calibration_text
 from tactomo.recordings.recording_writer import Entry
-from tactomo.recordings.replay import Replay, parse_replay_url, read_replay, without_calibrations
+from tactomo.recordings.replay import Replay, read_replay, without_calibrations
 from tactomo.running import Running, announced
 from tactomo.service.status import Status
 from tactomo.service.supervision import Supervision, notify
@@ -149,7 +149,7 @@ class Daemon:
         # the time of the replay; None where the ports are live
         self.playback = None if replay is None else replay.playback
         _check_methods(replay, self._methods, description)
-        protocol = _protocol(config)
+        protocol = find_protocol(config.protocol).name if replay is None else replay.protocol
         channels = tuple(c for c in Channel if c in description.channels)
         calibration, self._unused = _find_calibration(
             config, description, self._description_file, replay
@@ -537,13 +537,6 @@ def _check_methods(
         )
     for method in made_by:
         check_method(method, description)
-
-
-def _protocol(config: DaemonConfig) -> str:
-    """Return what the ports speak: as configured or, where they are replayed, as recorded."""
-    if config.ports[0].startswith(f"{REPLAY_SCHEME}://"):
-        return parse_replay_url(config.ports[0])[0].origin.protocol
-    return find_protocol(config.protocol).name
 
 
 def _find_calibration(

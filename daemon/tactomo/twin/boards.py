@@ -10,10 +10,10 @@ import numpy as np
 from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray, IntArray
 
-from tactomo.twin.foreign import Frame, Grounded
+from tactomo.twin.foreign import Emulator, Frame, Grounded
 
 
-class MatrixBoard:
+class MatrixBoard(Emulator):
     """A board that prints a table at its own pace, once it was told to; see `protocols.matrix`."""
 
     def __init__(self, description: SensorDescription, rate_hz: float) -> None:
@@ -30,10 +30,6 @@ class MatrixBoard:
         self._grounded = Grounded(description)
         self._start = description.instrument.start.encode()
         self._is_single_ended = description.instrument.referenced == "single_ended"
-
-    def held_up(self) -> list[bytes]:
-        """See `Emulator`: nothing."""
-        return []
 
     def greeting(self) -> list[bytes]:
         """See `Emulator`."""

@@ -11,7 +11,6 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from tactomo_models import SensorDescription
@@ -34,10 +33,10 @@ class Frame:
     time_s: float  #: when it began, by the instrument's clock
 
 
-class Emulator(Protocol):
+class Emulator:
     """One instrument's side of its language, made of the sensor and the frames a second at first.
 
-    A protocol's class names it as its `emulator`. For use by one thread.
+    A protocol's class names a subclass as its `emulator`. For use by one thread.
     """
 
     rate_hz: float  # frames a second; the host may have changed it
@@ -45,15 +44,19 @@ class Emulator(Protocol):
 
     def greeting(self) -> list[bytes]:
         """Return what it says when it is switched on, or plugged in."""
+        return []
 
     def hear(self, data: bytes) -> list[bytes]:
         """Obey what the host says, in any chunking, and return the answers."""
+        raise NotImplementedError
 
     def frame(self, frame: Frame) -> list[bytes]:
         """Return what it sends of a frame, message by message."""
+        raise NotImplementedError
 
     def held_up(self) -> list[bytes]:
         """Return what it says when the host did not take a frame; often nothing."""
+        return []
 
 
 class Grounded:

@@ -27,7 +27,7 @@ from tactomo.protocols.sciospec import (
     Ack,
     message,
 )
-from tactomo.twin.foreign import Frame, Grounded
+from tactomo.twin.foreign import Emulator, Frame, Grounded
 
 GROUPS: Final = 4
 RATE_HZ: Final = (0.1, 100.0)
@@ -35,7 +35,7 @@ FREQUENCY_HZ: Final = (100.0, 1e6)
 TIMEOUT_S: Final = 0.2  #: how long it waits for the rest of a message
 
 
-class SciospecEmulator:
+class SciospecEmulator(Emulator):
     """See `Emulator`."""
 
     def __init__(self, description: SensorDescription, rate_hz: float) -> None:
@@ -59,10 +59,6 @@ class SciospecEmulator:
             0x0D: lambda content: content in (b"\x01", b"\x02", b"\x03"),
         }
         self._reset(b"")
-
-    def greeting(self) -> list[bytes]:
-        """Return nothing: it is switched on already."""
-        return []
 
     def held_up(self) -> list[bytes]:
         """Return that data could not be sent."""

@@ -15,7 +15,8 @@ import pytest
 from fixture_types import Run
 from processes import children_of, is_running
 from tactomo.cli import app
-from tactomo.cli.children import ChildError, Family
+from tactomo.cli.children import Family
+from tactomo.errors import TactomoError
 from tactomo.twin import TwinConfig
 from tactomo_models import load_description
 from typer.main import get_command
@@ -196,7 +197,7 @@ def test_a_family_notices_whoever_ends_and_tells_its_last_words() -> None:
         late = family.start("second", "viewer", "--viewer-port", taken, *NOWHERE)
         assert family.wait_for_an_end() is late
         assert viewer.is_running
-        with pytest.raises(ChildError, match=r"(?s)second stopped.*cannot listen"):
+        with pytest.raises(TactomoError, match=r"(?s)second stopped.*cannot listen"):
             late.wait_ready()
     assert not viewer.is_running
     assert viewer.status == 0

@@ -120,7 +120,7 @@ RULES = RecordingConfig(keep_days=7, keep_gb=0)
 
 
 def gone(recordings: list[KeptRecording], rules: RecordingConfig = RULES) -> list[int]:
-    return [int(deletion.path.name) for deletion in to_delete(recordings, rules)]
+    return [int(path.name) for path, _ in to_delete(recordings, rules)]
 
 
 def days(first: int, end: int, offset_s: float = 0.0) -> list[KeptRecording]:

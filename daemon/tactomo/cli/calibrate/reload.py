@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from tactomo.cli.output import say
-from tactomo.cli.sensors import SensorError, find_commanded, find_control
+from tactomo.cli.sensors import SensorError, find_commanded
 
 if TYPE_CHECKING:
     from tactomo_client import CalibrationInForce
@@ -46,7 +46,7 @@ def taken_up(
     own = files.path(sensor)
     again = f"tactomo calibrate reload --sensor {sensor}"
     try:
-        found = _reloaded(find_control(sensor, address, keys), keys)
+        found = _reloaded(find_commanded(sensor, address, keys).control, keys)
     except CalibrationRefused as error:
         return f"not in force: the daemon of {sensor} refused it: {error}"
     except KeysError as error:

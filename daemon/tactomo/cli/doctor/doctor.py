@@ -137,7 +137,8 @@ def _of_file(
 ) -> Evidence:
     from tactomo_models.array_files import READERS
 
-    from tactomo.cli.doctor.evidence import DoctorError, of_arrays, of_recording
+    from tactomo.cli.doctor.evidence import of_arrays, of_recording
+    from tactomo.errors import TactomoError
 
     suffix = what.suffix.lower()
     if suffix == ".mcap":
@@ -149,7 +150,7 @@ def _of_file(
         return of_recording(recording, description, frames)
     if suffix in (".npz", *READERS):
         return of_arrays(what, description, array, pattern, frames)
-    raise DoctorError(f"{what} is neither .mcap nor .npz", "give a recording, scans, or no file")
+    raise TactomoError(f"{what} is neither .mcap nor .npz", "give a recording, scans, or no file")
 
 
 def _diagnose(evidence: Evidence) -> dict[str, Diagnosis]:

@@ -40,12 +40,6 @@ CHANGES = "dv"
 ANY_RING = "tank_disc"  # stands for a sheet that nobody has described, while its file is read
 
 
-class DoctorError(TactomoError):
-    """There is nothing that could be examined."""
-
-    name = "cannot_examine"
-
-
 class Heard(NamedTuple):
     """How scans came in over the ports while they were examined."""
 
@@ -89,7 +83,7 @@ def of_daemon(
     keys: Keys | None,
     progress: Callable[[float], None],
 ) -> Evidence:
-    """Listen to a running daemon; raise DoctorError where no daemon answers, or it has no scans."""
+    """Listen to a daemon; raise TactomoError where none answers, or it has no scans."""
     import zmq
     from tactomo_client.connection import connect_subscriber
     from tactomo_client.messages import MAP, SCAN, STATUS, topic
@@ -108,7 +102,7 @@ def of_daemon(
         connection.close()
     after = (said[STATUS] or [before])[-1]
     if not said[SCAN]:
-        raise DoctorError(
+        raise TactomoError(
             f"the daemon of {sensor} is {after['state']} and has no scans to examine",
             "`tactomo status` says what is wrong",
         )
@@ -130,7 +124,7 @@ def _first_status(connection: Connection, where: str) -> dict[str, Any]:
         for message in connection.heard(left_s):
             if message.kind == "status":
                 return message.fields
-    raise DoctorError(f"no daemon answers at {where}", "`tactomo status` shows its state")
+    raise TactomoError(f"no daemon answers at {where}", "`tactomo status` shows its state")
 
 
 def _layout_of_status(
@@ -146,7 +140,7 @@ def _layout_of_status(
         note = f"the description {said['model']} is not here: give --description; adjacent pairs"
         return PatternLayout(scan_pairs(electrodes), electrodes), (note,)
     if known.sha256 != said["sha256"]:
-        raise DoctorError(
+        raise TactomoError(
             f"the daemon's sensor {said['model']} is not the description {known.name} that is here",
             "give the daemon's own with --description",
         )
@@ -195,7 +189,7 @@ def _gaps(counters: list[int]) -> int:
 def of_recording(recording: Recording, description: str | None, frames: slice | None) -> Evidence:
     """Read a recording's ports; `description` is its own if None.
 
-    Raises DoctorError where there are no scans in it.
+    Raises TactomoError where there are no scans in it.
     """
     known = load_description(description) if description else recording.origin.read_description()
     ports = [_scans_of_port(recording, n) for n in range(len(recording.origin.ports))]
@@ -210,7 +204,7 @@ def of_recording(recording: Recording, description: str | None, frames: slice | 
                 sum(bool(scan.flags & ScanFlag.SATURATED) for scan in taken),
             )
     if not scans:
-        raise DoctorError(
+        raise TactomoError(
             f"there are no scans of {known.name} in {recording.path}",
             "`tactomo info` shows what is in it; it may need another --description",
         )
@@ -261,7 +255,7 @@ def of_arrays(
 ) -> Evidence:
     """Read a file of arrays as `tactomo reconstruct` does; see `tactomo doctor --help`.
 
-    Raises DoctorError, ImportFileError or DataError where it cannot be read or examined, or its
+    Raises TactomoError or DataError where it cannot be read or examined, or its
     scans fit no description or pattern.
     """
     arrays = load_arrays(path)
@@ -286,7 +280,7 @@ def of_arrays(
     scans = {}
     for channel, volts in read.volts.items():
         if not len(volts[which]):
-            raise DoctorError(
+            raise TactomoError(
                 f"{path} has {len(volts)} scans, none of these", "give other --frames"
             )
         scans[channel if channel in names else names[0]] = Scans(volts[which], times_s)
@@ -298,13 +292,13 @@ def _at_rest(path: Path, arrays: Mapping[str, NDArray[Any]]) -> str:
     if name is not None:
         return name
     if CHANGES in arrays:
-        raise DoctorError(
+        raise TactomoError(
             f"{path} holds changes of voltages ({CHANGES}) and no scans at rest: noise and "
             "reciprocity belong to voltages",
             "name an array of scans of the unpressed sheet with --array",
         )
     held = ", ".join(arrays) or "nothing"
-    raise DoctorError(f"{path} holds {held}", "name the array of scans at rest with --array")
+    raise TactomoError(f"{path} holds {held}", "name the array of scans at rest with --array")
 
 
 def _fitting_pattern(
@@ -317,10 +311,10 @@ def _fitting_pattern(
         offset = int(np.median(np.minimum(offsets, electrodes - offsets)))
         return NamedPattern(electrodes, max(1, offset), 1)
     if array not in arrays:
-        raise DoctorError(f"{path} holds {', '.join(arrays)}", f"there is no array {array!r}")
+        raise TactomoError(f"{path} holds {', '.join(arrays)}", f"there is no array {array!r}")
     raw = np.atleast_2d(arrays[array])
     if raw.ndim != 2 or raw.dtype.kind not in "fiuc" or raw.size == 0:
-        raise DoctorError(
+        raise TactomoError(
             f"{path}: {array} is {raw.dtype} {raw.shape}", "it must be numbers, (T, voltages)"
         )
     count = raw.shape[1]
@@ -328,7 +322,7 @@ def _fitting_pattern(
     adjacent = [NamedPattern(electrodes, 1, 1)] * (electrodes * (electrodes - 3) == count)
     found = [*fitting_patterns(np.abs(raw) if raw.dtype.kind == "c" else raw), *adjacent]
     if not found:
-        raise DoctorError(
+        raise TactomoError(
             f"{path}: {array} has {count} voltages a scan, which fit no pattern",
             "give --description or --pattern, such as 16:opposite:adjacent",
         )

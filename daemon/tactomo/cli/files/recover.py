@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tactomo.cli.options import RecordingFile, examples, need_recording, typer_app
-from tactomo.cli.output import say
+from tactomo.cli.output import progress_bar, say
 
 if TYPE_CHECKING:
     from tactomo.recordings.recording import Summary
@@ -36,20 +36,11 @@ def recover(
     run. After a gap, the replay starts cold; where the reference is lost, there are no maps.
     """
     need_recording(recording)
-    from rich.progress import BarColumn, DownloadColumn, TimeRemainingColumn
-
-    from tactomo.cli.console import progress
     from tactomo.recordings.recording import open_recording
     from tactomo.recordings.recovery import recover as rewrite
 
     target = output or recording.parent / f"{recording.stem}-recovered.mcap"
-    columns = ("recovering", BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    with progress(*columns) as bar:
-        task = bar.add_task("")
-
-        def show(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-
+    with progress_bar("recovering") as show:
         recovery = rewrite(recording, target, show)
     say(f"{target}: {_kept(open_recording(target).summary)}")
     for line in _lost(recovery):

@@ -11,7 +11,7 @@ import typer
 
 from tactomo.cli import options
 from tactomo.cli.output import print_json, say
-from tactomo.cli.sensors import find_control, find_twin, reader_of
+from tactomo.cli.sensors import find_commanded, find_twin, reader_of
 from tactomo.errors import TactomoError
 from tactomo.plain import counted
 
@@ -39,7 +39,7 @@ def tare(
     from tactomo_client import Daemon
     from tactomo_client.control import TARE_TIMEOUT_S
 
-    with Daemon(find_control(sensor, address, keys), keys=keys) as daemon:
+    with Daemon(find_commanded(sensor, address, keys).control, keys=keys) as daemon:
         needs_s = _tare_s(daemon.request("status"))
         if needs_s > SOON_S:
             say(f"leave the skin alone: the scans take {needs_s:.0f} s to come", err=True)
@@ -105,7 +105,7 @@ def record(
         raise typer.BadParameter("--seconds goes with FILE, not with start or stop")
     if what == "stop" and (name is not None or maps):
         raise typer.BadParameter("stop takes no file, and no --maps")
-    daemon = Daemon(find_control(sensor, address, keys), keys=keys)
+    daemon = Daemon(find_commanded(sensor, address, keys).control, keys=keys)
     if to_file:
         _record_for(daemon, what, seconds, maps or None)
     elif what == "stop":
@@ -140,7 +140,7 @@ def method(
     """
     from tactomo_client import Daemon
 
-    with Daemon(find_control(sensor, address, keys), keys=keys) as daemon:
+    with Daemon(find_commanded(sensor, address, keys).control, keys=keys) as daemon:
         in_force = daemon.set_method(name).tier
         if budget_ms is not None:
             daemon.set_budget(budget_ms)
