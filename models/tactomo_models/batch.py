@@ -17,7 +17,7 @@ from tactomo_models.archive import read_arrays, write_whole
 from tactomo_models.array_files import bounded
 from tactomo_models.arrays import FloatArray
 from tactomo_models.calibration.taught_skin import TaughtSkin
-from tactomo_models.errors import CalibrationError, DataError
+from tactomo_models.errors import CalibrationError, DataError, os_errors_as
 from tactomo_models.growing_arrays import growing_arrays
 from tactomo_models.reconstruct import Reconstructor
 from tactomo_models.scans.reference import Reference
@@ -123,42 +123,35 @@ def reconstruct_file(
     failed, failure, repeated = 0, "", 0
     repeats = Repeats(description.pairs)
     total = max(len(channel) for channel in scans.values())
-    try:
-        with (
-            growing_arrays(TYPES, shapes, _folder_of(target)) as arrays,
-            threadpool_limits(1),  # as the daemon runs: `seconds` are what a robot would see
-        ):
-            reconstructor = Reconstructor(
-                description,
-                method=method,
-                budget_s=BUDGET_S,
-                curve=curve,
-                taught=taught,
-            )
-            reconstructor.set_reference(reference)
-            for index in range(total):
-                taken = {name: _scan(scans, name, index) for name in Channel}
-                for name, scan in taken.items():
-                    found = None if scan is None else repeats.find(name, scan, reference)
-                    if scan is not None and found is not None:
-                        taken[name] = found.without(scan)
-                        repeated += taken[name] is None
-                start = time.perf_counter()
-                companions = [(name, float(each[index])) for name, each in readings.items()]
-                compared = reconstructor.compare(*taken.values(), companions=companions)
-                frame = reconstructor.solve(compared)
-                arrays.append({"seconds": time.perf_counter() - start, **_frame_row(frame)})
-                for contact in frame.contacts:
-                    arrays.append(_contact_row(index, contact))
-                failed += bool(frame.failure)
-                failure = failure or frame.failure
-                if progress:
-                    progress(index + 1, total)
-            write_whole(target, arrays.write)
-    except OSError as error:
-        raise DataError(
-            f"cannot write {target}: {error.strerror}; name a file in a folder that you may write"
-        ) from error
+    next_step = "name a file in a folder that you may write"
+    with (
+        os_errors_as(DataError, f"cannot write {target}", next_step),
+        growing_arrays(TYPES, shapes, _folder_of(target)) as arrays,
+        threadpool_limits(1),  # as the daemon runs: `seconds` are what a robot would see
+    ):
+        reconstructor = Reconstructor(
+            description, method=method, budget_s=BUDGET_S, curve=curve, taught=taught
+        )
+        reconstructor.set_reference(reference)
+        for index in range(total):
+            taken = {name: _scan(scans, name, index) for name in Channel}
+            for name, scan in taken.items():
+                found = None if scan is None else repeats.find(name, scan, reference)
+                if scan is not None and found is not None:
+                    taken[name] = found.without(scan)
+                    repeated += taken[name] is None
+            start = time.perf_counter()
+            companions = [(name, float(each[index])) for name, each in readings.items()]
+            compared = reconstructor.compare(*taken.values(), companions=companions)
+            frame = reconstructor.solve(compared)
+            arrays.append({"seconds": time.perf_counter() - start, **_frame_row(frame)})
+            for contact in frame.contacts:
+                arrays.append(_contact_row(index, contact))
+            failed += bool(frame.failure)
+            failure = failure or frame.failure
+            if progress:
+                progress(index + 1, total)
+        write_whole(target, arrays.write)
     return Reconstructed(total, failed, failure, repeated)
 
 
@@ -182,12 +175,8 @@ def read_scans(source: Path, description: SensorDescription) -> ReferencedScans:
     Raises:
         DataError: the file cannot be read or does not fit the sensor.
     """
-    try:
+    with os_errors_as(DataError, f"cannot read {source}", "give an .npz file of scans"):
         arrays = read_arrays(source)
-    except OSError as error:
-        raise DataError(
-            f"cannot read {source}: {error.strerror}; give an .npz file of scans"
-        ) from error
     scans, references = scans_of(source, arrays, description)
     count = len(next(iter(scans.values())))
     readings, at_rest = companions_of(source, arrays, description, count)

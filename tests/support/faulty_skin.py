@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 from noisy_skin import rms
-from tactomo_lab.scenes.faults import with_lead
+from tactomo_lab.scenes.case import with_lead
 from tactomo_models import SensorDescription, SkinSimulator
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.physics.bare_sheet import exchanged

@@ -136,7 +136,7 @@ def _magnitudes(study: _Study) -> Finding:
         ours = _mean_and_deviation([e.error for e in of], "{:.0%}")
         made.add_row(
             method,
-            f"{theirs[0]:.0%} (at {theirs[1]:g} kPa)" if theirs else "",
+            "{error:.0%} (at {pressure_kpa:g} kPa)".format(**theirs) if theirs else "",
             f"{ours} (at {worst.pressure_kpa:g} kPa)",
             _mean_and_deviation([e.of_range for e in of], "{:.0%}"),
             _mean_and_deviation([e.of_contacts for e in of], "{:.0%}"),
@@ -148,10 +148,7 @@ def _magnitudes(study: _Study) -> Finding:
         "the change at 200 kPa; of contacts: likewise, of the magnitudes that contacts have",
         {
             "errors": [asdict(error) for error in errors],
-            "paper_hardware": {
-                method: {"error": error, "pressure_kpa": kpa}
-                for method, (error, kpa) in PAPER_MAGNITUDE_ERROR.items()
-            },
+            "paper_hardware": PAPER_MAGNITUDE_ERROR,
         },
     )
 
@@ -166,7 +163,7 @@ def _places(study: _Study) -> Finding:
         theirs = PAPER_LOCALISATION_MM.get(method)
         made.add_row(
             method,
-            f"{theirs[0]:.1f} ± {theirs[1]:.1f}" if theirs else "",
+            "{mean_mm:.1f} ± {std_mm:.1f}".format(**theirs) if theirs else "",
             _mean_and_deviation([place.mass_error_mm for place in of], "{:.1f}"),
             _mean_and_deviation([place.contact_error_mm for place in of], "{:.1f}"),
             f"{sum(place.contacts == 1 for place in of) / len(of):.0%}",
@@ -178,10 +175,7 @@ def _places(study: _Study) -> Finding:
         "one contact: share of presses in which one is",
         {
             "places": [asdict(place) for place in found],
-            "paper_hardware": {
-                method: {"mean_mm": mean, "std_mm": deviation}
-                for method, (mean, deviation) in PAPER_LOCALISATION_MM.items()
-            },
+            "paper_hardware": PAPER_LOCALISATION_MM,
         },
     )
 

@@ -61,14 +61,14 @@ GRID_MM: Final = 18.0  # of the holes that indenters are held by
 # What the paper prints, measured on hardware. Figs. 8 and 9: the magnitude error, and the pressure
 # at which the error was that large, kPa. Fig. 10: mean and standard deviation, mm.
 PAPER_MAGNITUDE_ERROR: Final = {
-    "tikhonov": (0.76, 200.0),
-    "cnn-single": (0.57, 160.0),
-    "cnn-multimodal": (0.21, 180.0),
+    "tikhonov": {"error": 0.76, "pressure_kpa": 200.0},
+    "cnn-single": {"error": 0.57, "pressure_kpa": 160.0},
+    "cnn-multimodal": {"error": 0.21, "pressure_kpa": 180.0},
 }
 PAPER_LOCALISATION_MM: Final = {
-    "tikhonov": (7.7, 6.6),
-    "cnn-single": (7.6, 5.8),
-    "cnn-multimodal": (6.4, 5.5),
+    "tikhonov": {"mean_mm": 7.7, "std_mm": 6.6},
+    "cnn-single": {"mean_mm": 7.6, "std_mm": 5.8},
+    "cnn-multimodal": {"mean_mm": 6.4, "std_mm": 5.5},
 }
 
 

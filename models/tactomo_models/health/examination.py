@@ -23,6 +23,7 @@ from tactomo_models.scans.plausibility import (
     examine_reference,
 )
 from tactomo_models.scans.polarity import Polarity
+from tactomo_models.scans.reference import variance_about_line
 from tactomo_models.sensor.description import SensorDescription
 
 MIN_SCANS_FOR_NOISE = 5  # a standard deviation to a third
@@ -130,14 +131,9 @@ def _sought(wiring: Wiring, layout: Layout, transfer: FloatArray | None) -> Bool
 
 def noise_about_line(scans: FloatArray) -> FloatArray:
     """Standard deviation (M,) of scans (n, M) about a straight line in time; 0 where unknown."""
-    count = len(scans)
-    if count < 3:
+    if len(scans) < 3:
         return np.zeros(scans.shape[1])
-    line = np.linspace(-1, 1, count)
-    line /= np.linalg.norm(line)
-    rest = scans - scans.mean(axis=0)
-    rest = rest - np.outer(line, line @ rest)
-    noise = np.sqrt((rest**2).sum(axis=0) / (count - 2))
+    noise = np.sqrt(variance_about_line(scans))
     return np.asarray(np.where(noise > 1e-12 * np.abs(scans).max(), noise, 0.0))
 
 

@@ -148,6 +148,15 @@ def _same(one: FloatArray | None, other: FloatArray | None) -> bool:
     return one is other or np.array_equal(one, other)
 
 
+def variance_about_line(scans: FloatArray) -> FloatArray:
+    """Variance (M,) of scans (n, M), n > 2, about a straight line in time."""
+    line = np.linspace(-1, 1, len(scans))
+    line /= np.linalg.norm(line)
+    rest = scans - scans.mean(axis=0)
+    rest = rest - np.outer(line, line @ rest)
+    return np.asarray((rest**2).sum(axis=0) / (len(scans) - 2))
+
+
 def noise_of_scans(scans: FloatArray) -> FloatArray | None:
     """Standard deviation (M,) of one scan, from n scans (n, M) at rest; None from a single one.
 
@@ -162,9 +171,7 @@ def noise_of_scans(scans: FloatArray) -> FloatArray | None:
 
     own, freedom = scans.var(axis=0, ddof=1), len(scans) - 1
     if len(scans) >= MIN_TREND_SCANS:
-        line = np.linspace(-1, 1, len(scans))
-        trend = (line @ (scans - scans.mean(axis=0))) ** 2 / (line @ line)
-        about_line = np.maximum(own * freedom - trend, 0.0) / (freedom - 1)
+        about_line = variance_about_line(scans)
         if about_line.sum() < own.sum() / 2:
             own, freedom = about_line, freedom - 1
     common = float(np.median(own)) * freedom / chdtri(freedom, 0.5)

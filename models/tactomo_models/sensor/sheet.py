@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from itertools import combinations
 from typing import Annotated, Literal, Self, TypeVar
 
 import numpy as np
@@ -30,6 +31,7 @@ from tactomo_models.sensor.section import Section
 # An electrode's impedance times the sheet's conductance. Against larger ones, simulated changes of
 # paper_square are wrong by 2e-5 of their largest here, by 1e-2 at 1e-12: rounding.
 MIN_CONTACT = 1e-9
+MIN_GAP_M = 1e-5  # between electrodes: as `Metres`
 # Below ten micrometres the mesh would be refined for ever.
 Metres = Annotated[float, Field(ge=1e-5, le=10, allow_inf_nan=False)]
 
@@ -237,10 +239,12 @@ def _check_even(sheet: Sheet, electrodes: Electrodes) -> None:
 
 def _check_apart(outline: Outline, electrodes: list[RimElectrode | Pad]) -> None:
     """Raise ValueError where electrodes lie over each other."""
-    on_rim = [(n, e) for n, e in enumerate(electrodes) if isinstance(e, RimElectrode)]
-    for place, (one, first) in enumerate(on_rim):
-        for other, second in on_rim[place + 1 :]:
-            ring_m = outline.lengths_m[first.ring]
+    for (one, first), (other, second) in combinations(enumerate(electrodes), 2):
+        if isinstance(first, Pad) and isinstance(second, Pad):
+            size = "pad_radius_m"
+            room = np.hypot(*np.subtract(first.centre_m, second.centre_m)) - 2 * first.radius_m
+        elif isinstance(first, RimElectrode) and isinstance(second, RimElectrode):
+            size, ring_m = "length_m", outline.lengths_m[first.ring]
             if first.length_m >= ring_m:
                 raise ValueError(
                     f"electrodes.length_m = {first.length_m}: more than the ring of {ring_m:.4g} m "
@@ -248,23 +252,15 @@ def _check_apart(outline: Outline, electrodes: list[RimElectrode | Pad]) -> None
                 )
             apart = abs(first.middle_m - second.middle_m) % ring_m
             room = min(apart, ring_m - apart) - (first.length_m + second.length_m) / 2
-            if first.ring == second.ring and room < MIN_GAP_M:
-                raise ValueError(_over(one, other, "electrodes.length_m"))
-    pads = [(n, e) for n, e in enumerate(electrodes) if isinstance(e, Pad)]
-    for place, (one, pad) in enumerate(pads):
-        for other, also in pads[place + 1 :]:
-            if np.hypot(*np.subtract(pad.centre_m, also.centre_m)) < 2 * pad.radius_m + MIN_GAP_M:
-                raise ValueError(_over(one, other, "electrodes.pad_radius_m"))
-
-
-MIN_GAP_M = 1e-5  # between electrodes: as `Metres`
-
-
-def _over(one: int, other: int, size: str) -> str:
-    return (
-        f"electrodes.positions_m[{one}] and [{other}] lie over each other: move one, or give a "
-        f"smaller {size}"
-    )
+            if first.ring != second.ring:
+                continue
+        else:
+            continue
+        if room < MIN_GAP_M:
+            raise ValueError(
+                f"electrodes.positions_m[{one}] and [{other}] lie over each other: move one, or "
+                f"give a smaller electrodes.{size}"
+            )
 
 
 def _check_side(electrodes: Electrodes, side: int, name: str, length_m: float) -> None:

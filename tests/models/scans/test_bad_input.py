@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from model_fixtures import Tared
 from noisy_skin import Skin, rms
 from shared_data import measured
-from tactomo_lab.scenes.faults import with_lead
+from tactomo_lab.scenes.case import with_lead
 from tactomo_models import (
     Flag,
     Press,
