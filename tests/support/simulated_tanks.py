@@ -64,9 +64,12 @@ def _simulated(
         kind[outline.coverage(points[0], points[1], SHARP_M) > 0.5] = sign
         truth[outline.coverage(radius_m * x, radius_m * y, SHARP_M) > 0.5] = sign
     assert description.structure is not None
-    saline = UnevenSheet(description, rng, UNEVENNESS, IMPEDANCE_SPREAD)
-    full = np.abs(saline.voltages(mesh, description.structure.saturated_ratio**kind))
-    changes = full - np.abs(saline.voltages(mesh))
+    seed = int(rng.integers(2**63))
+    impedance = np.exp(IMPEDANCE_SPREAD * rng.standard_normal(description.electrode_count))
+    saline = UnevenSheet(seed, UNEVENNESS, impedance)
+    ratio = description.structure.saturated_ratio**kind
+    full = np.abs(saline.voltages(description, mesh, ratio))
+    changes = full - np.abs(saline.voltages(description, mesh))
     noise = NOISE_SHARE * np.sqrt(np.mean(changes**2))
     return changes + noise * rng.standard_normal(len(changes)), truth
 

@@ -26,6 +26,7 @@ from tactomo_lab.scenes.drawing import (
     scale_of,
     seed_of,
 )
+from tactomo_lab.scenes.simulation import UnevenSheet
 
 END_KPA = 300.0  # of the response table that the pressures below are for
 
@@ -56,24 +57,15 @@ MAX_DISPLACED_M = 0.0014  # standard deviation of the electrodes' places along t
 
 
 @dataclass(frozen=True)
-class SheetErrors:
-    """How one sheet differs from its description."""
-
-    seed: int  #: of the field of conductivity errors
-    unevenness: float  #: standard deviation of that smooth field
-    impedance: FloatArray  #: (L,) contact impedances, relative to the description's
-    #: (L,) by how much each electrode sits off along the rim, counter-clockwise
-    displaced_m: FloatArray
-
-
-@dataclass(frozen=True)
 class TrainingScene:
     """A scene to simulate."""
 
     presses: tuple[Press, ...]  #: what presses
     contrast: float  #: of the structure channel when saturated
     opposite: bool  #: whether the magnitude channel changes against the description's sign
-    sheets: tuple[SheetErrors, SheetErrors]  #: errors of the magnitude and the structure sheet
+    sheets: tuple[UnevenSheet, UnevenSheet]  #: the magnitude and the structure sheet
+    #: (2, L) by how much each electrode of theirs sits off along the rim, counter-clockwise
+    displaced_m: FloatArray
 
 
 def paper_presses(
@@ -102,17 +94,18 @@ def draw_scene(description: SensorDescription, seed: int, number: int) -> Traini
     rng = np.random.default_rng(seed_of("training", "robust", seed, number))
     skin = np.random.default_rng(seed_of("training", "robust skin", seed, number // SAME_SKIN))
     opposite = bool(skin.integers(2)) and can_be_opposite(description)
-    sheets = (_sheet_errors(description, skin), _sheet_errors(description, skin))
+    (one, one_off), (other, other_off) = (_draw_sheet(description, skin) for _ in range(2))
     count = int(rng.choice(len(ROBUST_CONTACTS), p=ROBUST_CONTACTS))
     gap = scale_of(description) * ROBUST_GAP_M
     half_axis_m = ROBUST_HALF_AXIS_M if count < CROWD else CROWDED_HALF_AXIS_M
     soft = bool(rng.random() < SOFT)
 
-    def one() -> Press:
+    def press() -> Press:
         return _any_press(description, rng, half_axis_m, soft=soft)
 
-    presses = placed_apart(description, count, gap, one)
-    return TrainingScene(presses, draw_contrast(rng), opposite, sheets)
+    presses = placed_apart(description, count, gap, press)
+    off_m = np.stack([one_off, other_off])
+    return TrainingScene(presses, draw_contrast(rng), opposite, (one, other), off_m)
 
 
 def _any_press(
@@ -155,15 +148,14 @@ def _anywhere(description: SensorDescription, rng: np.random.Generator) -> tuple
     return x * description.width_m, y * description.height_m
 
 
-def _sheet_errors(description: SensorDescription, rng: np.random.Generator) -> SheetErrors:
+def _draw_sheet(
+    description: SensorDescription, rng: np.random.Generator
+) -> tuple[UnevenSheet, FloatArray]:
+    """A sheet, and by how much (L,) its electrodes sit off their places, metres."""
     electrodes = description.electrode_count
     impedance = np.exp(IMPEDANCE_DEVIATION * rng.standard_normal(electrodes))
     if rng.random() < WEAK_ELECTRODES:
         impedance[rng.integers(electrodes)] *= np.exp(rng.uniform(*np.log(WEAK_FACTOR)))
-    return SheetErrors(
-        seed=int(rng.integers(2**63)),
-        unevenness=rng.uniform(0, MAX_UNEVEN),
-        impedance=impedance,
-        displaced_m=rng.uniform(0, scale_of(description) * MAX_DISPLACED_M)
-        * rng.standard_normal(electrodes),
-    )
+    sheet = UnevenSheet(int(rng.integers(2**63)), rng.uniform(0, MAX_UNEVEN), impedance)
+    deviation_m = rng.uniform(0, scale_of(description) * MAX_DISPLACED_M)
+    return sheet, deviation_m * rng.standard_normal(electrodes)

@@ -67,6 +67,37 @@ class SheetState:
 AS_MADE = SheetState()
 
 
+@dataclass(frozen=True, eq=False)
+class UnevenSheet:
+    """One sheet, uneven in its own way."""
+
+    seed: int  #: of the smooth field of its conductivity errors, the same on whatever mesh
+    unevenness: float  #: standard deviation of that field
+    impedance: FloatArray  #: (L,) contact impedances, relative to the description's
+
+    def voltages(
+        self,
+        description: SensorDescription,  # the sensor
+        mesh: SheetMesh,
+        # (T,) how many times its own at rest the conductivity of each triangle is
+        ratio: FloatArray | float = 1.0,
+        state: SheetState = AS_MADE,
+    ) -> FloatArray:
+        """Noise-free volts (M,)."""
+        x, y = centroids(mesh)
+        length_m = description.width_m / 4
+        field = smooth_noise(x, y, length_m, np.random.default_rng(self.seed))
+        conductivity = (1 + self.unevenness * field) * ratio * (1 + state.warming)
+        if state.drift:
+            drift = smooth_noise(x, y, length_m, np.random.default_rng([self.seed, 1]))
+            conductivity = conductivity * (1 + state.drift * drift)
+        impedance = self.impedance * np.array(state.impedance or 1.0)
+        transfer = transfer_resistances(description, mesh, conductivity, impedance)
+        if state.leads:
+            transfer = exchanged(transfer, state.leads)
+        return scan_voltages(description, transfer) * volts_per_unit(description)
+
+
 class UnevenSkin:
     """The sheets of one sensor, uneven in their own way, and what they show of presses."""
 
@@ -87,10 +118,11 @@ class UnevenSkin:
         self._mesh = mesh
         self._warp: Warp = warp or (lambda mesh: mesh)
         rng = np.random.default_rng(seed)
-        self._sheets = {
-            name: UnevenSheet(description, rng, unevenness, impedance_deviation)
-            for name in description.channels
-        }
+        self._sheets = {}
+        for name in description.channels:
+            own = int(rng.integers(2**63))
+            spread = impedance_deviation * rng.standard_normal(description.electrode_count)
+            self._sheets[name] = UnevenSheet(own, unevenness, np.exp(spread))
         self._rest: dict[tuple[Channel, SheetState], FloatArray] = {}
 
     def voltages(
@@ -107,50 +139,18 @@ class UnevenSkin:
         for name, sheet in self._sheets.items():
             state = states.get(name, AS_MADE)
             ratio = conductivity_ratio(self.description, name, pressure, coverage)
-            pressed = sheet.voltages(mesh, ratio, state)
+            pressed = sheet.voltages(self.description, mesh, ratio, state)
             # Of one mesh, so that no change is a change of mesh.
-            volts[name] = volts[name] + pressed - sheet.voltages(mesh, state=state)
+            at_rest = sheet.voltages(self.description, mesh, state=state)
+            volts[name] = volts[name] + pressed - at_rest
         return volts
 
     def _at_rest(self, name: Channel, state: SheetState) -> FloatArray:
         if (name, state) not in self._rest:
             mesh = self._warp(self._mesh)
-            self._rest[name, state] = self._sheets[name].voltages(mesh, state=state)
+            sheet = self._sheets[name]
+            self._rest[name, state] = sheet.voltages(self.description, mesh, state=state)
         return self._rest[name, state]
-
-
-class UnevenSheet:
-    """One sheet, uneven in its own way; the arguments are those of `UnevenSkin`."""
-
-    def __init__(
-        self,
-        description: SensorDescription,
-        rng: np.random.Generator,
-        unevenness: float,
-        impedance_deviation: float,
-    ) -> None:
-        self._description = description
-        self._unevenness = unevenness
-        self._seed = int(rng.integers(2**63))  # the same field on whatever mesh
-        spread = impedance_deviation * rng.standard_normal(description.electrode_count)
-        self._impedance = np.exp(spread)
-
-    def voltages(
-        self, mesh: SheetMesh, ratio: FloatArray | float = 1.0, state: SheetState = AS_MADE
-    ) -> FloatArray:
-        """Volts (M,) where the conductivity of each triangle is so many times its own at rest."""
-        x, y = centroids(mesh)
-        length_m = self._description.width_m / 4
-        field = smooth_noise(x, y, length_m, np.random.default_rng(self._seed))
-        conductivity = (1 + self._unevenness * field) * ratio * (1 + state.warming)
-        if state.drift:
-            drift = smooth_noise(x, y, length_m, np.random.default_rng([self._seed, 1]))
-            conductivity = conductivity * (1 + state.drift * drift)
-        impedance = self._impedance * np.array(state.impedance or 1.0)
-        transfer = transfer_resistances(self._description, mesh, conductivity, impedance)
-        if state.leads:
-            transfer = exchanged(transfer, state.leads)
-        return scan_voltages(self._description, transfer) * volts_per_unit(self._description)
 
 
 def centroids(sheet: SheetMesh) -> FloatArray:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
-from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -22,22 +21,18 @@ import numpy as np
 from tactomo_models.archive import read_arrays, write_arrays
 from tactomo_models.arrays import FloatArray
 from tactomo_models.errors import DataError, ModelError, os_errors_as
-from tactomo_models.physics.bare_sheet import scan_voltages, transfer_resistances, volts_per_unit
 from tactomo_models.physics.mesh import SheetMesh, mesh_sheet, part_middles
 from tactomo_models.scene.press import strongest
 from tactomo_models.sensor.description import SensorDescription
-from tactomo_models.simulation.simulator import conductivity_ratio, smooth_noise
+from tactomo_models.simulation.simulator import conductivity_ratio
 from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
 from tactomo_lab.scenes.drawing import require_channels
-from tactomo_lab.scenes.presets import (
-    SheetErrors,
-    TrainingScene,
-    draw_scene,
-)
+from tactomo_lab.scenes.presets import TrainingScene, draw_scene
 from tactomo_lab.scenes.simulation import (
     SHARP_M,
+    UnevenSheet,
     displaced,
     truth_of,
     with_contrast,
@@ -49,17 +44,7 @@ SCENES = "scenes.npz"  # of a folder
 SPACING_SHARE = 5 / 6  # of the map's nodes' distance: 2.5 mm on the paper's sensor
 REFINEMENTS = 2
 PARTS = 3  # that each side of a triangle is divided into, where its conductivity is averaged
-FORMAT = 3  # raise it when what is drawn or simulated changes
-
-
-@dataclass(frozen=True)
-class _Sheet:
-    """A solved sheet."""
-
-    mesh: SheetMesh  # with electrodes where they really are
-    conductivity: FloatArray  # (T,) of each triangle, relative to the description's
-    impedance: FloatArray  # (L,) of its electrodes, likewise
-    rest: FloatArray  # (M,) volts while nothing presses
+FORMAT = 4  # raise it when what is drawn or simulated changes
 
 
 class SceneSimulator:
@@ -72,7 +57,7 @@ class SceneSimulator:
         require_channels(description, Channel.MAGNITUDE)
         self.description = description
         # Scenes in a row may have the same sheets.
-        self._sheets: dict[Channel, tuple[int, _Sheet]] = {}
+        self._last: dict[Channel, tuple[int, SheetMesh, FloatArray]] = {}
 
     @cached_property
     def _mesh(self) -> SheetMesh:
@@ -94,7 +79,7 @@ class SceneSimulator:
             sensor = with_opposite_magnitude(sensor)
         made: dict[str, Any] = {}
         for index, name in enumerate(self.description.channels):
-            rest, change = self._channel(sensor, name, scene, scene.sheets[index])
+            rest, change = self._channel(sensor, name, scene, index)
             made[f"{name}_rest"] = rest.astype(np.float32)
             made[f"{name}_change"] = change.astype(np.float32)
         truth = truth_of(sensor, scene.presses)
@@ -105,41 +90,24 @@ class SceneSimulator:
         return made
 
     def _channel(
-        self,
-        sensor: SensorDescription,
-        name: Channel,
-        scene: TrainingScene,
-        errors: SheetErrors,
+        self, sensor: SensorDescription, name: Channel, scene: TrainingScene, index: int
     ) -> tuple[FloatArray, FloatArray]:
         """Volts at rest and relative changes of one channel."""
-        sheet = self._sheet_of(name, errors)
+        sheet = scene.sheets[index]
+        mesh, rest = self._at_rest(name, sheet, scene.displaced_m[index])
         if not scene.presses:
-            return sheet.rest, np.zeros_like(sheet.rest)
-        ratio = _ratio_of(sensor, name, scene, sheet.mesh)
-        pressed = self._solve(sheet.mesh, sheet.conductivity * ratio, sheet.impedance)
-        return sheet.rest, (pressed - sheet.rest) / np.abs(sheet.rest)
+            return rest, np.zeros_like(rest)
+        pressed = sheet.voltages(sensor, mesh, _ratio_of(sensor, name, scene, mesh))
+        return rest, (pressed - rest) / np.abs(rest)
 
-    def _sheet_of(self, name: Channel, errors: SheetErrors) -> _Sheet:
-        """The last scene's sheet, if this one has the same."""
-        if name not in self._sheets or self._sheets[name][0] != errors.seed:
-            self._sheets[name] = (errors.seed, self._sheet(errors))
-        return self._sheets[name][1]
-
-    def _sheet(self, errors: SheetErrors) -> _Sheet:
-        """A sheet with its errors, solved at rest."""
-        mesh = displaced(self._mesh, self.description, errors.displaced_m)
-        x, y = mesh.mesh.p[:, mesh.mesh.t].mean(axis=1)
-        rng = np.random.default_rng(errors.seed)
-        field = smooth_noise(x, y, self.description.width_m / 4, rng)
-        conductivity = np.exp(errors.unevenness * field)
-        rest = self._solve(mesh, conductivity, errors.impedance)
-        return _Sheet(mesh, conductivity, errors.impedance, rest)
-
-    def _solve(
-        self, mesh: SheetMesh, conductivity: FloatArray, impedance: FloatArray
-    ) -> FloatArray:
-        transfer = transfer_resistances(self.description, mesh, conductivity, impedance)
-        return scan_voltages(self.description, transfer) * volts_per_unit(self.description)
+    def _at_rest(
+        self, name: Channel, sheet: UnevenSheet, displaced_m: FloatArray
+    ) -> tuple[SheetMesh, FloatArray]:
+        """Mesh and volts (M,) of a sheet; of the last scene's, if this one has the same."""
+        if name not in self._last or self._last[name][0] != sheet.seed:
+            mesh = displaced(self._mesh, self.description, displaced_m)
+            self._last[name] = (sheet.seed, mesh, sheet.voltages(self.description, mesh))
+        return self._last[name][1:]
 
 
 def _ratio_of(

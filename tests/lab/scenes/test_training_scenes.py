@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from tactomo_lab.scenes.presets import SheetErrors, TrainingScene, draw_scene
-from tactomo_lab.scenes.simulation import UnevenSkin, displaced, fine_mesh
+from tactomo_lab.scenes.presets import TrainingScene, draw_scene
+from tactomo_lab.scenes.simulation import UnevenSheet, UnevenSkin, displaced, fine_mesh
 from tactomo_lab.scenes.still_scenes import draw_still
 from tactomo_lab.training.training_scenes import SceneSimulator
 from tactomo_models import Press, SensorDescription
@@ -25,10 +23,12 @@ def robust_scenes(paper: SensorDescription) -> list[TrainingScene]:
     return [draw_scene(paper, 0, number) for number in range(200)]
 
 
-def even_sheets(description: SensorDescription) -> tuple[SheetErrors, SheetErrors]:
+def on_even_sheets(
+    description: SensorDescription, presses: tuple[Press, ...], contrast: float, opposite: bool
+) -> TrainingScene:
     electrodes = description.electrode_count
-    even = SheetErrors(0, 0.0, np.ones(electrodes), np.zeros(electrodes))
-    return even, even
+    even = UnevenSheet(0, 0.0, np.ones(electrodes))
+    return TrainingScene(presses, contrast, opposite, (even, even), np.zeros((2, electrodes)))
 
 
 def test_robust_scenes_have_everything_that_makes_a_skin_hard(
@@ -42,7 +42,7 @@ def test_robust_scenes_have_everything_that_makes_a_skin_hard(
     sheets = [sheet for scene in robust_scenes for sheet in scene.sheets]
     assert max(sheet.unevenness for sheet in sheets) > 0.07
     assert max(sheet.impedance.max() for sheet in sheets) > 5
-    displaced_m = np.concatenate([sheet.displaced_m for sheet in sheets])
+    displaced_m = np.concatenate([scene.displaced_m for scene in robust_scenes])
     assert 0.0005 < displaced_m.std() < 0.001
 
 
@@ -84,7 +84,7 @@ def test_voltages_agree_with_the_evaluations_finer_simulation(paper: SensorDescr
         paper, fine_mesh(paper), np.random.SeedSequence(1), unevenness=0.0, impedance_deviation=0.0
     )
     rest, pressed = skin.voltages([]), skin.voltages(TWO)
-    made = SceneSimulator(paper).simulate(TrainingScene(TWO, 100.0, False, even_sheets(paper)))
+    made = SceneSimulator(paper).simulate(on_even_sheets(paper, TWO, 100.0, False))
     for name in paper.channels:
         fine = (pressed[name] - rest[name]) / np.abs(rest[name])
         error = np.linalg.norm(made[f"{name}_change"] - fine) / np.linalg.norm(fine)
@@ -94,13 +94,13 @@ def test_voltages_agree_with_the_evaluations_finer_simulation(paper: SensorDescr
 
 def test_a_scenes_truth_and_facts(small: SensorDescription) -> None:
     presses = (Press(0.01, 0.0, 150.0, 0.008),)
-    made = SceneSimulator(small).simulate(TrainingScene(presses, 30.0, True, even_sheets(small)))
+    made = SceneSimulator(small).simulate(on_even_sheets(small, presses, 30.0, True))
     assert made["contacts"] == 1
     assert made["opposite"]
     assert made["map"].max() == pytest.approx(0.125, rel=1e-3)  # half way from 100 to 200 kPa
     assert made["pressed"].max() == 1
     assert made["map"].shape == made["pressed"].shape == (21, 21)
-    bare = SceneSimulator(small).simulate(TrainingScene((), 30.0, True, even_sheets(small)))
+    bare = SceneSimulator(small).simulate(on_even_sheets(small, (), 30.0, True))
     for name in ("magnitude", "structure"):
         assert not bare[f"{name}_change"].any()
         np.testing.assert_array_equal(bare[f"{name}_rest"], made[f"{name}_rest"])
@@ -113,7 +113,7 @@ def test_sheets_of_a_scene_are_its_own_whatever_was_simulated_before(
 ) -> None:
     """A simulator keeps the last sheets, as scenes in a row share them."""
     scenes = [draw_scene(small, 0, number) for number in (0, 1, 8)]
-    scenes.append(replace(scenes[0], sheets=even_sheets(small)))
+    scenes.append(on_even_sheets(small, scenes[0].presses, 30.0, False))
     one = SceneSimulator(small)
     for scene in (*scenes, *reversed(scenes)):
         again, anew = one.simulate(scene), SceneSimulator(small).simulate(scene)
