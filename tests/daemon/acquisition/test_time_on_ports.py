@@ -211,6 +211,20 @@ def test_a_board_that_is_reset_alone_is_never_paired_with_the_other(bench: Start
     assert all({"structure_missing", "magnitude_missing"} & set(f["flags"]) for f in alone)
 
 
+def test_status_tells_one_reset_of_two_channels_once(bench: Start) -> None:
+    b = bench(ports=2, sync_wait_ms=50).tare()
+    boards = Boards(b, magnitude=100, structure=100)
+    b.listener.frame(boards.scan())
+    boards.counters = dict.fromkeys(Channel, -1)
+    boards.device_us = dict.fromkeys(Channel, 0)
+    for _ in range(3):
+        b.listener.frame(boards.scan())
+    told = b.ask("status")["events"]
+    [reset] = [each for each in told["troubles"] if each["name"] == "device_restarted"]
+    assert reset["detail"].endswith("; once since the start")
+    assert told["counts"]["device_restarted"] == 1
+
+
 def events(b: Any) -> set[str]:
     return {event["name"] for event in b.listener.of("event")}
 
