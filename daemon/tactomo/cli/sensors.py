@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
@@ -20,6 +21,21 @@ class SensorError(TactomoError):
     """No sensor, or several, may be meant."""
 
     name = "which_sensor"
+
+
+@contextmanager
+def of_this_version() -> Iterator[None]:
+    """A block that reads what a daemon told.
+
+    Raises TactomoError where another program, or another version, told it of other types.
+    """
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise TactomoError(
+            f"what answers is no daemon of this version: its messages have other values ({error})",
+            "see them by `tactomo status --json`; install the version of that daemon",
+        ) from error
 
 
 def find_sensor(name: str | None, address: str | None, keys: Path | None = None) -> Running:
@@ -123,7 +139,8 @@ def _several(there: list[tuple[str, str, str]]) -> SensorError:
 def _heard_of(name: str | None, address: str, keys: Path | None) -> Running:
     """Return a sensor that a stream carries, by its status."""
     status = _status_of(name, address, keys)
-    ports = tuple(str(port.get("url")) for port in status.get("ports") or ())
+    with of_this_version():
+        ports = tuple(str(port.get("url")) for port in status.get("ports") or ())
     control = _from_here(str(status.get("control")), address)
     return Running("daemon", control, status["sensor"], address, ports)
 

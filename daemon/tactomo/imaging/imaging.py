@@ -225,6 +225,8 @@ class Imaging:
 
     def _note_reference(self, rest: KnownSkin) -> None:
         """Say that this reference is in force."""
+        if self.rest is None:
+            self._publisher.lift("no_reference")
         self.rest = rest
         self.calibration.meet_skin(rest.reference)
         self.taring.note_reference()

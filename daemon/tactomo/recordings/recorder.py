@@ -26,7 +26,7 @@ from tactomo.events import OnEvent
 from tactomo.recordings.active_recording import MAX_QUEUED_BYTES, ActiveRecording
 from tactomo.recordings.recording import Origin
 from tactomo.recordings.recording_writer import create
-from tactomo.recordings.rotation import dated, list_recordings, next_path, to_delete
+from tactomo.recordings.rotation import dated, is_numbered, list_recordings, next_path, to_delete
 from tactomo.timing import wall_clock_ns
 from tactomo.worker import Worker
 
@@ -207,6 +207,12 @@ class Recorder(Worker):
             raise RecordingError(
                 f"{path.parent} is a link that leads out of {folder}, the folder of recordings",
                 "give a name in that folder, or configure another one: recording.folder",
+                "cannot_write",
+            )
+        if is_numbered(path):
+            raise RecordingError(
+                f"{path.name} is a name of a numbered recording, of which the oldest are deleted",
+                "give another name, without number and date",
                 "cannot_write",
             )
         return path

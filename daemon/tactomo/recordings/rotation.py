@@ -41,6 +41,11 @@ def next_path(folder: Path, sensor: str, now_s: float) -> Path:
     return folder / f"{sensor}-{max(numbers, default=0) + 1:06d}-{stamp}.mcap"
 
 
+def is_numbered(path: Path) -> bool:
+    """Whether a file is called as those of `next_path` are."""
+    return re.fullmatch(ROTATED_NAME, path.name, re.ASCII) is not None
+
+
 def list_recordings(folder: Path, sensor: str) -> list[KeptRecording]:
     """Return a sensor's recordings, the oldest first; raise OSError as folders do."""
     return sorted(_recordings(folder, sensor)) if folder.is_dir() else []

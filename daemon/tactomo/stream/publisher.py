@@ -124,6 +124,11 @@ class Publisher(Worker):
         if not self._stopping.is_set():
             self._wake()
 
+    def lift(self, flag: str) -> None:
+        """Leave out a flag of the newest frame's from now on; for the thread of the frames."""
+        left = [each for each in self.header["flags"] if each != flag]
+        self.header = {**self.header, "flags": left}
+
     def envelope(self, kind: str) -> dict[str, Any]:
         """Return the envelope of the last message of a kind as of now; for any thread."""
         return self._stamp(self._sequence[kind], self.header)

@@ -8,22 +8,30 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from fixture_types import Run
 from shared_data import measured
+from tactomo.cli.doctor.evidence import evidence_of_messages
+from tactomo.cli.doctor.stream_findings import stream_findings
+from tactomo.cli.sensors import of_this_version
+from tactomo.errors import TactomoError
 from tactomo.recordings.recording_writer import write_recording
 from tactomo_client import request
-from tactomo_models import SensorDescription, load_description, load_or_build_artifact
+from tactomo_client.fake import FakeSensor
+from tactomo_client.messages import array_to_wire
+from tactomo_models import DataError, SensorDescription, load_description, load_or_build_artifact
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.bare_sheet import scan_voltages
 from tactomo_models.sensor.description_file import shipped_text
 from tactomo_models.sensor.named_pattern import NamedPattern
 from tactomo_models.sensor.pattern import reciprocal_pairs, scan_pairs
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
-from waiting import PATIENCE_S, wait_until
+from waiting import PATIENCE_S, repeated, wait_until
 from whole_system import SENSOR, Demo, running_demo
 
 NOISE = 1e-3
@@ -257,6 +265,65 @@ def test_the_broken_device_is_called_broken(tactomo: Run) -> None:
 def test_the_tank_is_not(tactomo: Run, arguments: list[str]) -> None:
     outcome = tactomo("doctor", measured("tank_sciospec_20fps.npz"), *arguments, "--json", status=0)
     assert report(outcome)["verdict"] == "healthy"
+
+
+def said_by(description: SensorDescription, volts: FloatArray) -> dict[str, dict[str, Any]]:
+    """A status, a scan and a map as a daemon sends them, as far as `doctor` reads them."""
+    port = {"packets": 9, "corrupt": 0, "faulty": 0, "device": {"device_id": "board-1"}}
+    about: dict[str, Any] = {"model": description.name, "file": None, "sha256": description.sha256}
+    about["electrodes_mm"] = [[0.0, 0.0]] * description.electrode_count
+    issue = {"severity": "warning", "what": "it hums", "next_step": "oil it"}
+    status = {"state": "running", "description": about, "ports": [port], "dropped_scans": 0}
+    scan = {name: array_to_wire(volts) for name in ("magnitude", "structure")}
+    taken = {"scan_counter": 1, "device_us": 50_000, "acquired_monotonic_ns": 50_000_000}
+    return {
+        "status": {**status, "sensor": "skin", "issues": [issue]},
+        "scan": {**scan, **taken},
+        "map": {"flags": [], "contacts": []},
+    }
+
+
+def test_messages_that_no_daemon_sends_end_in_no_traceback(
+    tactomo: Run, paper: SensorDescription, rest: FloatArray
+) -> None:
+    said = said_by(paper, rest)
+    kinds = {kind: [fields] for kind, fields in said.items()}
+    wrong_values: tuple[Any, ...] = (None, 7, "x", [], [1], {"a": 1}, [None], 1e308, [{}])
+    sound = evidence_of_messages(kinds, kinds["status"] * 2, None, False)
+    assert [finding.detail for finding in sound.issues] == ["it hums"]
+    assert sound.devices == ("board-1",)
+    for kind, fields in said.items():
+        for key in fields:
+            for value in wrong_values:
+                wrong = {**kinds, kind: [{**fields, key: value}]}
+                with suppress(TactomoError, DataError), of_this_version():
+                    found = evidence_of_messages(wrong, wrong["status"], None, False)
+                    stream_findings(found)
+    wrong_status = {**said["status"], "dropped_scans": "few"}
+    with (
+        FakeSensor("skin") as fake,
+        repeated(lambda: fake.publish_message("scan", said["scan"])),
+        repeated(lambda: fake.publish_message("status", wrong_status)),
+    ):
+        look = ("doctor", "-s", "skin", "--address", fake.address, "--seconds", "1")
+        told = tactomo(*look, status=1).stderr
+    assert "what answers is no daemon of this version: " in told
+
+
+def test_a_path_that_a_stranger_names_is_not_opened(
+    tactomo: Run, paper: SensorDescription, rest: FloatArray, tmp_path: Path
+) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(shipped_text("paper_square"))
+    said = said_by(paper, rest)
+    for named in ({"file": str(file)}, {"model": str(file)}):
+        about = {**said["status"]["description"], **named}
+        status = {**said["status"], "description": about}
+        for is_ours, is_opened in ((True, True), (False, False)):
+            kinds = {"status": [status], "scan": [said["scan"]], "map": []}
+            found = evidence_of_messages(kinds, [status], None, is_ours)
+            assert isinstance(found.layout, SensorDescription) == is_opened
+            assert any("give --description" in note for note in found.notes) != is_opened
 
 
 @pytest.fixture(scope="module")

@@ -76,6 +76,25 @@ def test_contacts_held_down_through_a_restart_are_still_there(begin: Any) -> Non
 
 
 @pytest.mark.slow
+def test_a_status_between_the_first_reference_and_its_first_frame_is_of_a_tared_skin(
+    begin: Any,
+) -> None:
+    def told(b: Any) -> str:
+        status = b.ask("status")
+        return f"{[issue['what'] for issue in status['issues']]} {status['flags']}"
+
+    b = begin(volts(False))
+    b.listener.event("tared")  # no scan has come since
+    assert "tared" not in told(b)
+    assert "no_reference" not in told(b)
+    b.daemon.stop()
+    b = begin(volts(True))
+    b.listener.event("reference_disputed")
+    assert "tared" not in told(b)
+    assert "no_reference" not in told(b)
+
+
+@pytest.mark.slow
 def test_two_tares_on_command_override_the_reference_that_was_kept(begin: Any) -> None:
     once(begin)
     kept = reference_path("left").read_bytes()

@@ -15,6 +15,7 @@ from tactomo.recordings import recorder
 from tactomo.recordings.recording import Origin, open_recording
 from tactomo.recordings.recording_writer import RecordingWriter
 from tactomo.recordings.rotation import KeptRecording, list_recordings, to_delete
+from tactomo_client import ControlError
 from tactomo_protocol import Channel
 
 DAY_S = 86_400.0
@@ -79,6 +80,19 @@ def test_numbers_go_on_whatever_the_clock_and_strangers_do(bench: Start, tmp_pat
     assert path.name.startswith("left-000008-")
     assert strangers <= {each.name for each in folder.iterdir()}
     assert all((folder / name).read_text() == "precious" for name in strangers)
+
+
+def test_a_named_recording_is_never_deleted_for_its_age(bench: Start, tmp_path: Path) -> None:
+    b = bench(recording={"folder": tmp_path, "keep_days": 1e-9, "rotate_mb": 0.01}).tare()
+    with pytest.raises(ControlError, match="the oldest are deleted") as refused:
+        b.ask("record_start", path="left-999999-20260101T000000Z.mcap")
+    assert refused.value.name == "cannot_write"
+    b.ask("record_start", path="left-999999-x.mcap")
+    b.step()
+    b.ask("record_stop")
+    b.ask("record_start")  # deletes what is too much
+    names = sorted(path.name for path in tmp_path.glob("*.mcap"))
+    assert [name[:12] for name in names] == ["left-000001-", "left-999999-"]
 
 
 @pytest.mark.slow

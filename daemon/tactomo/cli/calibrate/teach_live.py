@@ -108,9 +108,7 @@ class _Session:
             raise TactomoError(
                 "the daemon's sensor description is not on this computer", "give --description"
             )
-        assert heard.after is not None
-        devices = [port["device"]["device_id"] for port in heard.after["ports"] if port["device"]]
-        self._subject = Subject.of(self._sensor, heard.layout, devices)
+        self._subject = Subject.of(self._sensor, heard.layout, heard.devices)
         return {name: each.volts.mean(axis=0) for name, each in heard.scans.items()}, heard.layout
 
     def _take_one(self, description: SensorDescription) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,11 +19,14 @@ from tactomo_client.schema import STALE_AFTER_S
 from tactomo_models import DescriptionError, load_description
 from tactomo_models.array_files import NUMBERS, bounded
 from tactomo_models.arrays import FloatArray
+from tactomo_models.health.findings import Finding, Level
 from tactomo_models.scans.plausibility import Layout
+from tactomo_models.sensor.description_file import shipped_descriptions
 from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
 from tactomo_models.sensor.pattern import PatternLayout, scan_pairs
 from tactomo_protocol import SCAN_COUNTERS, Channel, Hello, Scan, ScanFlag
 
+from tactomo.cli.sensors import of_this_version
 from tactomo.errors import TactomoError
 from tactomo.recordings.imported_scans import (
     AT_REST,
@@ -32,11 +35,13 @@ from tactomo.recordings.imported_scans import (
     read_scans,
 )
 from tactomo.recordings.recording import Recording
+from tactomo.running import running
 
 if TYPE_CHECKING:
     from tactomo_client.connection import Connection
 
 CHANGES = "dv"
+ISSUE_LEVELS = {"error": Level.FAULT, "warning": Level.ADVICE}
 ANY_RING = "tank_disc"  # stands for a sheet that nobody has described, while its file is read
 
 
@@ -66,9 +71,9 @@ class Evidence:
     layout: Layout  # the sensor's description, or a pattern alone
     scans: dict[str, Scans]  # of each channel
     heard: Heard | None = None  # how they came; None for a file of arrays
-    # before, after: the daemon's status then; empty but for a daemon
-    before: Mapping[str, Any] = field(default_factory=dict)
-    after: Mapping[str, Any] = field(default_factory=dict)
+    left_out: int = 0  # dual scans that came and that the daemon left out meanwhile
+    issues: tuple[Finding, ...] = ()  # what the daemon itself found wrong
+    devices: tuple[str, ...] = ()  # their ids
     flags: frozenset[str] = frozenset()  # those that any frame had
     pressed: int = 0  # frames with a contact
     frames: int = 0  # frames that came
@@ -100,20 +105,42 @@ def of_daemon(
                 said[message.kind].append(message.fields)
     finally:
         connection.close()
-    after = (said[STATUS] or [before])[-1]
-    if not said[SCAN]:
+    is_ours = any(each.stream == stream for each in running("daemon"))
+    with of_this_version():
+        evidence = evidence_of_messages(said, [before, *said[STATUS]], description, is_ours)
+        evidence.title += f", for {seconds:g} s"
+    return evidence
+
+
+def evidence_of_messages(
+    said: Mapping[str, list[dict[str, Any]]],  # messages by their kind
+    statuses: list[dict[str, Any]],  # from the one before on
+    description: str | None,
+    is_ours: bool,  # whether files that the status names may be opened
+) -> Evidence:
+    """Return what a daemon's messages tell; raises as data of other types do."""
+    before, after = statuses[0], statuses[-1]
+    maps, scans = said["map"], said["scan"]
+    if not scans:
         raise TactomoError(
-            f"the daemon of {sensor} is {after['state']} and has no scans to examine",
+            f"the daemon of {after['sensor']} is {after['state']} and has no scans to examine",
             "`tactomo status` says what is wrong",
         )
-    layout, notes = _layout_of_status(after, description)
-    scans = _scans_of_messages(said[SCAN])
-    evidence = Evidence(f"the daemon of {sensor}, for {seconds:g} s", layout, scans, notes=notes)
-    evidence.before, evidence.after = before, after
-    evidence.heard = _heard_of_messages(said[SCAN], before, after)
-    evidence.frames = len(said[MAP])
-    evidence.flags = frozenset(flag for frame in said[MAP] for flag in frame["flags"])
-    evidence.pressed = sum(bool(frame["contacts"]) for frame in said[MAP])
+    layout, notes = _layout_of_status(after, description, is_ours)
+    heard = _heard_of_messages(scans, before, after)
+    title = f"the daemon of {after['sensor']}"
+    evidence = Evidence(title, layout, _scans_of_messages(scans), heard)
+    evidence.notes = notes
+    evidence.left_out = int(after["dropped_scans"] - before["dropped_scans"])
+    evidence.issues = tuple(
+        Finding("daemon", ISSUE_LEVELS[each["severity"]], each["what"], each["next_step"])
+        for each in after.get("issues") or []
+    )
+    devices = (port["device"] for port in after["ports"])
+    evidence.devices = tuple(each["device_id"] for each in devices if each)
+    evidence.frames = len(maps)
+    evidence.flags = frozenset(flag for frame in maps for flag in frame["flags"])
+    evidence.pressed = sum(bool(frame["contacts"]) for frame in maps)
     return evidence
 
 
@@ -128,11 +155,15 @@ def _first_status(connection: Connection, where: str) -> dict[str, Any]:
 
 
 def _layout_of_status(
-    status: Mapping[str, Any], description: str | None
+    status: Mapping[str, Any], description: str | None, is_ours: bool
 ) -> tuple[Layout, tuple[str, ...]]:
     said = status["description"]
+    file = said.get("file")
     try:
-        known = load_description(description or said.get("file") or said["model"])
+        is_file = file is not None or said["model"] not in shipped_descriptions()
+        if description is None and is_file and not is_ours:
+            raise DescriptionError(f"{file or said['model']}: a path that another program gave")
+        known = load_description(description or file or said["model"])
     except DescriptionError:
         if description is not None:
             raise

@@ -21,7 +21,7 @@ def stream_findings(evidence: Evidence) -> list[Finding]:
         found += [_packets_found(evidence.heard), _lost_found(evidence, evidence.heard.lost)]
     if evidence.frames:
         found.append(_pressed_found(evidence))
-    return [*found, *_issues_found(evidence)]
+    return [*found, *evidence.issues]
 
 
 def _packets_found(heard: Heard) -> Finding:
@@ -53,10 +53,9 @@ def _lost_found(evidence: Evidence, lost: int) -> Finding:
     figures: dict[str, Any] = {"number": float(lost)}
     if not lost:
         return Finding("lost_scans", Level.OK, f"none of {count} dual scans", "", figures)
-    before, after = (each.get("dropped_scans", 0) for each in (evidence.before, evidence.after))
     # Scans that came and were left out tell that the computer was busy: then others may have been
     # lost for the same reason, and nothing is known against cable and board.
-    is_busy = after - before > LOST_SHARE * count
+    is_busy = evidence.left_out > LOST_SHARE * count
     share = lost / (count + lost)
     is_fault = share > (LATE_SHARE if is_busy else LOST_SHARE) and lost >= FEWEST_LOST
     return Finding(
@@ -81,11 +80,3 @@ def _pressed_found(evidence: Evidence) -> Finding:
         "leave the skin alone while it is examined; if nothing touches it, run `tactomo tare`",
         figures,
     )
-
-
-def _issues_found(evidence: Evidence) -> list[Finding]:
-    levels = {"error": Level.FAULT, "warning": Level.ADVICE}
-    return [
-        Finding("daemon", levels[issue["severity"]], issue["what"], issue["next_step"])
-        for issue in evidence.after.get("issues") or []
-    ]

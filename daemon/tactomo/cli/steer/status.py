@@ -8,8 +8,7 @@ import typer
 
 from tactomo.cli import options
 from tactomo.cli.output import print_json
-from tactomo.cli.sensors import newest_status
-from tactomo.errors import TactomoError
+from tactomo.cli.sensors import newest_status, of_this_version
 from tactomo.plain import counted, plain
 
 app = options.typer_app()
@@ -48,17 +47,12 @@ def lines_of(status: dict[str, Any]) -> list[str]:
     Raises TactomoError where another program, or another version, made it of other types.
     """
     lines = []
-    try:
+    with of_this_version():
         for issue in status.get("issues") or []:
             colour = "red" if issue["severity"] == "error" else "yellow"
             lines += [typer.style(issue["what"], fg=colour, bold=True), f"    {issue['next_step']}"]
         lines.append(f"{status['sensor']}: {_words(status['state'])}")
         rows = _rows(status)
-    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        raise TactomoError(
-            f"what answers is no daemon of this version: its status has no such values ({error})",
-            "see them by `tactomo status --json`; install the version of that daemon",
-        ) from error
     return lines + [f"{typer.style(f'{name:<13} ', bold=True)}{value}" for name, value in rows]
 
 
