@@ -219,7 +219,12 @@ def load_skins(path: Path | None, **overrides: Any) -> tuple[DaemonConfig, ...] 
     skins = [
         _checked(
             DaemonConfig,
-            {**_default_addresses(number), **_merged(common, table), "name": name},
+            {
+                "stream": next_address(DEFAULT_STREAM, number),
+                "control": next_address(DEFAULT_CONTROL, number),
+                **_merged(common, table),
+                "name": name,
+            },
             given,
             f"{path}, [skins.{name}]",
         )
@@ -230,13 +235,6 @@ def load_skins(path: Path | None, **overrides: Any) -> tuple[DaemonConfig, ...] 
         return skins[0]
     _check_apart(path, skins)
     return tuple(skins)
-
-
-def _default_addresses(number: int) -> dict[str, str]:
-    return {
-        "stream": next_address(DEFAULT_STREAM, number),
-        "control": next_address(DEFAULT_CONTROL, number),
-    }
 
 
 def _merged(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:

@@ -42,7 +42,9 @@ def announced(program: Running) -> Iterator[None]:
         with contextlib.suppress(OSError):
             folder = _own_folder()
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            _remove_left(folder)
+            for left in folder.glob(f"*{SUFFIX}"):
+                if _read(left) is None:
+                    left.unlink(missing_ok=True)
             number, name = tempfile.mkstemp(dir=folder)
             undo.callback(os.close, number)
             fcntl.flock(number, fcntl.LOCK_EX)
@@ -85,9 +87,3 @@ def _read(file: Path) -> Running | None:
             fields = json.load(opened)
             return Running(**{**fields, "ports": tuple(fields["ports"])})
     return None
-
-
-def _remove_left(folder: Path) -> None:
-    for file in folder.glob(f"*{SUFFIX}"):
-        if _read(file) is None:
-            file.unlink(missing_ok=True)

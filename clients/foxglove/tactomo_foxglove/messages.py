@@ -181,7 +181,7 @@ def contacts_scene(
 
 
 def _disc(contact: Contact, description: Mapping[str, Any], stale: str) -> fox.CylinderPrimitive:
-    diameter_m = contact_diameter_mm(contact) * 1e-3
+    diameter_m = 2e-3 * math.sqrt(max(contact.area_mm2, 0.0) / math.pi)  # of the same area
     height_m = disc_height_m(contact, description)
     return fox.CylinderPrimitive(
         pose=_above(contact, height_m / 2),
@@ -254,11 +254,6 @@ def _text(text: str, pose: fox.Pose, colour: fox.Color, pixels: float) -> fox.Te
     )
 
 
-def contact_diameter_mm(contact: Contact) -> float:
-    """Return the diameter of a disc of the contact's area."""
-    return 2.0 * math.sqrt(max(contact.area_mm2, 0.0) / math.pi)
-
-
 def disc_height_m(contact: Contact, description: Mapping[str, Any]) -> float:
     """Return how high a contact's disc is: by its pressure, flat where that is not known."""
     level = _level(contact, description)
@@ -281,10 +276,8 @@ def _disc_colour(contact: Contact, description: Mapping[str, Any], stale: str) -
     level = _level(contact, description)
     if level is None:
         return LIGHT_TOUCH
-    at = min(max(level, 0.0), 1.0) * (len(appearance.COLOURS) - 1)
-    channels = zip(*appearance.COLOURS, strict=True)
-    red, green, blue = (np.interp(at, range(len(appearance.COLOURS)), c) / 255 for c in channels)
-    return fox.Color(r=float(red), g=float(green), b=float(blue), a=0.6)
+    red, green, blue = (appearance.colours(np.array(level)) / 255).tolist()
+    return fox.Color(r=red, g=green, b=blue, a=0.6)
 
 
 def sheet_scene(sensor: str, description: Mapping[str, Any], time_ns: int) -> fox.SceneUpdate:

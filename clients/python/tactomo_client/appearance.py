@@ -44,14 +44,19 @@ def map_pixels(frame: Frame, description: Mapping[str, Any]) -> NDArray[np.uint8
     if shown is None:
         return None
     image, top = shown
-    level = np.clip(np.nan_to_num(image) / top, 0.0, 1.0) * (len(COLOURS) - 1)
-    knots, palette = np.arange(len(COLOURS)), np.array(COLOURS, dtype=float)
-    pixels = np.stack([np.interp(level, knots, palette[:, c]) for c in range(3)], axis=-1)
+    level = np.nan_to_num(image) / top
+    pixels = colours(level)
     if frame.structure is not None:
-        pressed = (np.nan_to_num(frame.structure) > 0.5) & (level < 0.05)
+        pressed = (np.nan_to_num(frame.structure) > 0.5) & (level < 0.0125)
         pixels[pressed] = PRESSED_COLOUR
     pixels[~known_nodes(frame, image)] = UNKNOWN_COLOUR
     return pixels.astype(np.uint8)
+
+
+def colours(level: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the colours (..., 3), 0 to 255, of shares of a scale's top."""
+    knots, palette = np.linspace(0.0, 1.0, len(COLOURS)), np.array(COLOURS, dtype=float)
+    return np.stack([np.interp(level, knots, channel) for channel in palette.T], axis=-1)
 
 
 def companion_words(companion: Mapping[str, Any]) -> str:

@@ -283,11 +283,8 @@ def _intact(start: int, chunk: Chunk) -> IntactChunk:
     end = start + _HEADER.size + len(chunk.data)
     messages = [record for record in records if isinstance(record, Message)]
     channels = [record for record in records if isinstance(record, Channel)]
-    return IntactChunk(start, end, end + _index_bytes(messages), messages, channels)
-
-
-def _index_bytes(messages: list[Message]) -> int:
-    return 15 * len({message.channel_id for message in messages}) + 16 * len(messages)
+    index_bytes = 15 * len({message.channel_id for message in messages}) + 16 * len(messages)
+    return IntactChunk(start, end, end + index_bytes, messages, channels)
 
 
 def unpack_chunk(chunk: Chunk) -> list[McapRecord]:

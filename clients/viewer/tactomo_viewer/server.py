@@ -12,7 +12,7 @@ import asyncio
 import errno
 import signal
 from collections.abc import AsyncIterator, Collection
-from importlib import resources
+from pathlib import Path
 
 from aiohttp import WSCloseCode, web
 from aiohttp.typedefs import Handler, Middleware
@@ -30,7 +30,7 @@ PORTS_TRIED = 20
 
 TWIN_POLL_S = 1.0
 MAX_QUESTION_BYTES = 16 * 1024
-PAGE_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
+PAGE = Path(__file__).with_name("page")
 HEADERS = {
     "Cache-Control": "no-cache",
     "Content-Security-Policy": (
@@ -128,11 +128,12 @@ class Viewer:
         app.cleanup_ctx.append(self._running)
         app.on_shutdown.append(self._say_goodbye)
         app.router.add_get("/socket", self._socket)
-        for file in (resources.files("tactomo_viewer") / "page").iterdir():
-            path = "/" if file.name == "index.html" else f"/{file.name}"
-            kind = PAGE_TYPES["." + file.name.split(".")[-1]]
-            app.router.add_get(path, _file(file.read_bytes(), kind))
+        app.router.add_get("/", self._page)
+        app.router.add_static("/", PAGE)
         return app
+
+    async def _page(self, _: web.Request) -> web.FileResponse:
+        return web.FileResponse(PAGE / "index.html")
 
     async def _running(self, _: web.Application) -> AsyncIterator[None]:
         self._feed = Feed(self._sensor, self._stream, self._keys, self._wake)
@@ -208,10 +209,3 @@ def _only_for(served_host: str) -> Middleware:
         return response
 
     return check
-
-
-def _file(content: bytes, content_type: str) -> Handler:
-    async def send(_: web.Request) -> web.Response:
-        return web.Response(body=content, content_type=content_type, charset="utf-8")
-
-    return send

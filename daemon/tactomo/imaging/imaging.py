@@ -229,7 +229,7 @@ class Imaging:
             self._publisher.lift("no_reference")
         self.rest = rest
         self.calibration.meet_skin(rest.reference)
-        self.taring.note_reference()
+        self.taring.has_reference = True
 
     @property
     def maps_published(self) -> int:

@@ -87,7 +87,7 @@ class Taring:
         self._put_in_force = put_in_force
         self._fall_back = fall_back
         self._on_event = on_event
-        self._has_reference = False
+        self.has_reference = False  # then a tare that is refused is not begun again
         self._tare: _Scans | None = None
         self._deadline_s = 0.0
         self._taken: _Taken | None = None  # the next tare waits for it, whoever asks meanwhile
@@ -108,10 +108,6 @@ class Taring:
         self._put_off()
         if answer is not None:
             self._tare.answers.append(answer)
-
-    def note_reference(self) -> None:
-        """Take note that there is a reference: a tare that is refused is not begun again."""
-        self._has_reference = True
 
     def check(self) -> None:
         """Put in force what is ready; give up a tare on command for which nothing comes."""
@@ -186,7 +182,7 @@ class Taring:
 
     def _refuse(self, tare: _Scans, refusal: CommandError) -> None:
         self._on_event("tare_refused", refusal.cause, refusal.next_step)
-        if not self._has_reference and not self._fall_back(refusal.cause):
+        if not self.has_reference and not self._fall_back(refusal.cause):
             self.start()  # without a reference there is nothing else to do
         for answer in tare.answers:
             answer.set_exception(refusal)

@@ -277,7 +277,11 @@ class Sciospec(ForeignProtocol):
         if is_in_phase:
             self.trouble, self.patience_s = None, self._usual_patience_s
         elif math.isfinite(self.patience_s):  # to ask it anew would change nothing
-            self.trouble, self.patience_s = _out_of_phase(quadrature), math.inf
+            self.patience_s = math.inf
+            self.trouble = Trouble(
+                f"{quadrature:.0%} of the signal is out of phase with the current",
+                "calibrate the instrument with a resistor, or lower `instrument.frequency_hz`",
+            )
         return is_in_phase
 
     def _differences(self, parts: NDArray[np.void]) -> NDArray[np.complex128]:
@@ -393,13 +397,6 @@ def is_message(data: bytes) -> bool:
     if data[0] == ACK_TAG:
         return data[2] in _CODES and data[3] == ACK_TAG
     return data[-1] == DATA_TAG and 1 <= data[2] <= 8 and bool(data[3] and data[4])
-
-
-def _out_of_phase(share: float) -> Trouble:
-    return Trouble(
-        f"{share:.0%} of the signal is out of phase with the current",
-        "calibrate the instrument with a resistor, or lower `instrument.frequency_hz`",
-    )
 
 
 def _check(description: SensorDescription) -> None:

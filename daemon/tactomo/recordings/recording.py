@@ -28,7 +28,7 @@ from pydantic import BaseModel, Field, Strict, StrictBool, StrictInt, StrictStr
 from tactomo_client import MessageError, recording_file
 from tactomo_client.errors import RecordingError as ClientRecordingError
 from tactomo_client.messages import MAX_ENTRIES, array_from_wire
-from tactomo_client.recording_file import intact_chunks
+from tactomo_client.recording_file import messages_beyond
 from tactomo_models import CalibrationError, Reference, SensorDescription, load_description
 from tactomo_models.calibration.calibration_file import PressureCalibration, parse_calibration
 from tactomo_models.errors import DescriptionError
@@ -277,13 +277,8 @@ def _summarise(path: Path, origin: Origin) -> Summary:
     summary.corrupt = sum(each.damaged for each in counts)
     summary.faulty = sum(each.faulty for each in counts)
     summary.references = len(references)
-    summary.has_more = bool(stops) and _has_chunks(path, stops[0])
+    summary.has_more = bool(stops) and any(True for _ in messages_beyond(path, stops[0]))
     return summary
-
-
-def _has_chunks(path: Path, start: int) -> bool:
-    with open_file(path) as file:
-        return any(True for _ in intact_chunks(file, start))
 
 
 def _count_bytes(summary: Summary, port: int, message: Message) -> None:

@@ -70,7 +70,7 @@ class ZenohProxy(Relay):
             self._readers.peers.check()
             if time.monotonic() >= look_at_s:
                 look_at_s = time.monotonic() + LOOK_S
-                inlet.ask_news()
+                inlet.ask_status()  # as a daemon sends one every second
 
     def close(self) -> None:
         """Close everything, whatever `open` came to."""
@@ -128,14 +128,12 @@ class _Inlet:
             self._subscribers.pop(key).undeclare()
         for key in wanted - self._subscribers.keys():
             self._subscribers[key] = self._session.declare_subscriber(key, self._take)
-        self._ask_status({_key(self.address, prefix) for prefix in anew}, only_news=False)
+        self.ask_status({_key(self.address, prefix) for prefix in anew})
 
-    def ask_news(self) -> None:
-        """Ask for each status that somebody wants, as a daemon sends one every second."""
-        self._ask_status(set(self._subscribers), only_news=True)
-
-    def _ask_status(self, keys: set[str], only_news: bool) -> None:
-        for key in keys:
+    def ask_status(self, keys: set[str] | None = None) -> None:
+        """Ask for the last status of some keys; of all that somebody wants, for news alone."""
+        only_news = keys is None
+        for key in self._subscribers if keys is None else keys:
             above, _, kind = key.rpartition("/")
             if kind in ("*", STATUS):
                 self._session.get(
