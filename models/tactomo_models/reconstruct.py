@@ -64,7 +64,7 @@ class Reconstructor:
 
     Attributes:
         description: the sensor.
-        artifact: what is precomputed for it.
+        sensor: the same, with its artifact and what is worked out once.
         curve: the one in force; it may be set at any time.
         taught: what presses at known places have taught; likewise. None where nothing.
 
@@ -86,7 +86,7 @@ class Reconstructor:
         self.taught = taught
         self.budget_s = budget_s
         skin = Skin.of(description, artifact)
-        self.artifact = skin.artifact
+        self.sensor = skin.tare.sensor
         self._skin = replace(skin, regularisation=description.instrument.regularisation)
         self._tare = skin.tare
         self._repeats = Repeats(description.pairs)
@@ -163,7 +163,7 @@ class Reconstructor:
 
         Raises DataError where a channel has another number of voltages than the sensor.
         """
-        tare = Tare.take(self._tare.sensor, reference)
+        tare = Tare.take(self.sensor, reference)
         if getattr(self._methods[self._name], "uses_sheets", False):
             _ = tare.sheets
         return tare

@@ -13,7 +13,6 @@ import numpy as np
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.drift.baseline import BaselineTracker
-from tactomo_models.methods.method import Skin
 from tactomo_models.reconstruct import DEFAULT_BUDGET_S, Reconstructor
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scans.tare import Tare
@@ -45,7 +44,7 @@ def skin_at_start(
     Takes some tenths of a second. The reconstructor measures against `known` from then on.
     """
     tracker = BaselineTracker(reconstructor)
-    sensor = Skin.of(reconstructor.description, reconstructor.artifact).tare.sensor
+    sensor = reconstructor.sensor
     # As even ones the sheets tell well enough, and at once.
     tracker.begin(Tare.take(sensor, known, is_even=True))
     if tracker.explains_as_drift(now, elapsed_s):

@@ -78,7 +78,7 @@ class BaselineTracker:
         self.refusal = ""
         self._reconstructor = reconstructor
         self._time_constant_s = time_constant_s
-        self._subspace = DriftSubspace(reconstructor.description, reconstructor.artifact)
+        self._subspace = DriftSubspace(reconstructor.sensor)
         self._memory = PressMemory(reconstructor.description, self._subspace)
         self._channels: dict[Channel, ChannelBaseline] = {}
         self._release = _Release()

@@ -17,15 +17,13 @@ import scipy.sparse as sp
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray, IntArray
-from tactomo_models.physics.artifact import Artifact
-from tactomo_models.physics.bare_sheet import scan_voltages, transfer_slopes
-from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
+from tactomo_models.physics.actual_sheet import UNEVEN_DRIFT
 from tactomo_models.scans.frame_noise import noise_limit
+from tactomo_models.scans.tare import Sensor
 from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.sensor.description import SensorDescription
 
-SMOOTH_SHARE: Final = 0.25  # of the sheet's width: how far conductivity wanders together
-HIGHEST_ORDER: Final = 4  # half waves across the sheet
+FIELD_STD: Final = 2**0.5  # of the cosines of a square sheet's estimate, each of its prior size
 CELLS: Final = 20  # across the sheet: creep is told apart by them
 CREEP: Final = 0.01  # of the bare conductivity that a decade of time under pressure leaves
 CREEP_BEGIN_S: Final = 1.0
@@ -44,19 +42,17 @@ class Explained:
 
 
 class DriftSubspace:
-    """The modes of one sensor's drift: the gain, the smooth ones, and one for each cell's creep.
+    """The modes of one sensor's drift: the gain, the smooth ones, and one for each cell's creep."""
 
-    Making it takes a tenth of a second.
-    """
-
-    def __init__(self, description: SensorDescription, artifact: Artifact) -> None:
+    def __init__(self, sensor: Sensor) -> None:
+        description, artifact = sensor.description, sensor.artifact
         self._size_m = (description.width_m, description.height_m)
         x, y = artifact.bare.points[:, artifact.bare.pressable]
         places = self._cell_of(x, y), np.arange(len(x))
         own = sp.csr_matrix((np.ones(len(x)), places), (CELLS**2, len(x)))
-        predicted = scan_voltages(description, artifact.bare.transfer)
+        predicted = sensor.forward.bare_voltages
         cells = (own @ artifact.jacobian.T).T * np.sign(predicted)[:, None]
-        smooth = self._smooth_modes(description)
+        smooth = sensor.drift[:, 1:] / (UNEVEN_DRIFT * FIELD_STD)
         # (M, K) change of the logarithm of each voltage by a unit of each mode: a factor e for the
         # gain, a field of unit standard deviation for each smooth one together with the others, a
         # relative change of 1 for a cell
@@ -72,31 +68,6 @@ class DriftSubspace:
         column = np.clip(np.floor((x_m / width_m + 0.5) * CELLS), 0, CELLS - 1)
         row = np.clip(np.floor((y_m / height_m + 0.5) * CELLS), 0, CELLS - 1)
         return np.asarray(row * CELLS + column, np.intp)
-
-    def _smooth_modes(self, description: SensorDescription) -> FloatArray:
-        coarse = 2.0  # times the map's spacing: enough for what is smooth
-        spacing_m = coarse * description.spacing_m
-        sheet = mesh_sheet(description, spacing_m, refinements=1)
-        fields = np.stack(self._smooth_fields(sheet))
-        transfer, slopes = transfer_slopes(description, sheet, fields)
-        voltages = scan_voltages(description, transfer)
-        return np.stack([scan_voltages(description, each) / voltages for each in slopes], axis=1)
-
-    def _smooth_fields(self, sheet: SheetMesh) -> list[FloatArray]:
-        """Fields (T,) that together vary over `SMOOTH_SHARE`, with unit variance in all."""
-        width_m, height_m = self._size_m
-        x, y = sheet.mesh.p[:, sheet.mesh.t].mean(axis=1)
-        fields, variance = [], 0.0
-        for i in range(HIGHEST_ORDER + 1):
-            for j in range(HIGHEST_ORDER + 1):
-                if not 0 < i**2 + j**2 <= HIGHEST_ORDER**2:
-                    continue
-                size = np.exp(-(i**2 + j**2) * (np.pi * SMOOTH_SHARE) ** 2 / 4)
-                wave = np.cos(np.pi * i * (x / width_m + 0.5))
-                wave *= np.cos(np.pi * j * (y / height_m + 0.5))
-                fields.append(size * wave)
-                variance += float(np.mean(fields[-1] ** 2))
-        return [field / np.sqrt(variance) for field in fields]
 
     def explain(
         self,

@@ -118,25 +118,6 @@ def transfer_resistances(
     return transfer_of(description, electrode_fields(description, system))
 
 
-def transfer_slopes(
-    description: SensorDescription,  # the sensor
-    sheet: SheetMesh,  # its mesh of T triangles
-    changes: FloatArray,  # (K, T) of conductivity, relative to the description's
-) -> tuple[FloatArray, FloatArray]:
-    """Transfer resistances of an even sheet, and their derivatives by changes of conductivity.
-
-    Returns:
-        (L, L) as `transfer_resistances`, and (K, L, L): dR = -u^T dA u, with the fields u.
-    """
-    even = assemble_sheet(description, sheet, np.ones(changes.shape[1]))
-    fields = electrode_fields(description, even)
-    slopes = np.zeros((len(changes), *[description.electrode_count] * 2))
-    for slope, change in zip(slopes, changes, strict=True):
-        moved = assemble_sheet(description, sheet, 1 + change) - even  # it is linear in that
-        slope[:-1, :-1] = -fields.T @ (moved @ fields)
-    return transfer_of(description, fields), slopes
-
-
 def scan_voltages(description: SensorDescription, transfer: FloatArray) -> FloatArray:
     """Voltages (M,) in scan order that transfer resistances (L, L) lead to, relative.
 

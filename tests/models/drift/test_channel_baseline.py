@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from measured import measured
-from tactomo_models import Press, SensorDescription, SkinSimulator, load_or_build_artifact
+from tactomo_models import Press, Reconstructor, SensorDescription, SkinSimulator
 from tactomo_models.arrays import FloatArray
 from tactomo_models.drift.channel_baseline import BLOCK_S, MAX_RESIDUAL, ChannelBaseline
 from tactomo_models.drift.drift_model import DriftSubspace
@@ -47,7 +47,7 @@ class Followed:
 
 @pytest.fixture(scope="module")
 def subspace(small: SensorDescription) -> DriftSubspace:
-    return DriftSubspace(small, load_or_build_artifact(small))
+    return DriftSubspace(Reconstructor(small).sensor)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,6 @@ from tactomo_models.physics.bare_sheet import (
     scan_voltages,
     solve_bare_sheet,
     transfer_resistances,
-    transfer_slopes,
 )
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
@@ -78,18 +77,6 @@ def test_the_derivative_by_parameters_is_the_one_by_nodes_times_theirs(
     np.testing.assert_allclose(
         model.jacobian(here, where, onto), by_nodes @ onto, atol=1e-12 * np.abs(by_nodes).max()
     )
-
-
-def test_the_slopes_of_transfer_resistances_pass_a_taylor_test(
-    sheet: SheetMesh, small: SensorDescription
-) -> None:
-    changes = np.random.default_rng(7).normal(size=(2, sheet.mesh.t.shape[1]))
-    _, slopes = transfer_slopes(small, sheet, changes)
-    for change, slope in zip(changes, slopes, strict=True):
-        found = taylor_orders(
-            lambda at: transfer_resistances(small, sheet, at), 1 + 0 * change, slope, change, STEPS
-        )
-        assert found == pytest.approx(2, abs=0.1)
 
 
 def solve_directly(model: ForwardModel, sheet: SheetMesh, change: FloatArray) -> FloatArray:

@@ -23,7 +23,6 @@ from tactomo_models import (
 )
 from tactomo_models.arrays import FloatArray
 from tactomo_models.drift.drift_model import DriftSubspace, PressMemory
-from tactomo_models.physics.artifact import load_or_build_artifact
 from tactomo_models.physics.bare_sheet import scan_voltages, solve_bare_sheet, transfer_resistances
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import mesh_sheet
@@ -262,7 +261,7 @@ def test_a_frame_is_nan_off_the_sheet() -> None:
         for image in (frame.map, frame.pressure_kpa):
             assert image is not None
             np.testing.assert_array_equal(np.isnan(image), palm.off_sheet)
-    memory = PressMemory(palm, DriftSubspace(palm, load_or_build_artifact(palm)))
+    memory = PressMemory(palm, DriftSubspace(reconstructor.sensor))
     memory.add(0.0, 600.0, frame)
     creep = memory.creep(1.0, Channel.MAGNITUDE)
     assert np.isfinite(creep).all()
