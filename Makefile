@@ -122,7 +122,7 @@ wheels: $(RUN_READY)  ## wheels and source archives of every distribution, and a
 
 # The checklist of a release, in order; the first thing that is amiss ends it.
 release-check: $(READY)  ## all that a release must pass: clean, told, linted, built, installed, tested
-	git diff --quiet HEAD || { echo "commit first: there are changes"; exit 1; }
+	test -z "$$(git status --porcelain)" || { git status --short; echo "commit these first, or move them: archives would hold them"; exit 1; }
 	grep -q '^## $(VERSION)' CHANGELOG.md || { echo "CHANGELOG.md lacks $(VERSION)"; exit 1; }
 	$(MAKE) lint schema
 	git diff --quiet HEAD || { echo "commit what make schema has written"; exit 1; }

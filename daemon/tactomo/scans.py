@@ -6,11 +6,13 @@ Plain values without the serial stack, so that whatever is pure may import them.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from tactomo_models import Reference
 from tactomo_models.arrays import FloatArray
 from tactomo_protocol import Channel, Hello, ScanFlag
+
+if TYPE_CHECKING:
+    from tactomo_models import Reference
 
 MAX_QUADRATURE: Final = 0.3
 """Share of a signal out of phase with the current above which its real part alone misleads: at 0.3

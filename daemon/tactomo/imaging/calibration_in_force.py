@@ -16,7 +16,7 @@ from tactomo_models.scene.pressure import described_curve
 from tactomo.errors import CommandError
 from tactomo.events import OnEvent
 from tactomo.recordings.recorder import Recorder
-from tactomo.recordings.recording import calibration_text, recorded_calibration
+from tactomo.recordings.records import calibration_text, recorded_calibration
 
 
 class _Foreign(NamedTuple):

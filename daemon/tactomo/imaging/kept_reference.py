@@ -20,7 +20,7 @@ from tactomo.errors import RecordingError
 from tactomo.events import OnEvent
 from tactomo.protocols.interface import TWIN_ID
 from tactomo.recordings.recorder import Recorder
-from tactomo.recordings.recording import REFERENCE_ARRAYS
+from tactomo.recordings.records import REFERENCE_ARRAYS
 from tactomo.timing import wall_clock_ns
 
 COMPANION: Final = "companion_"

@@ -11,10 +11,9 @@ import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, Final, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, Final, NamedTuple
 
 import numpy as np
-from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_protocol import (
     MAX_DEVICE_US,
@@ -34,6 +33,9 @@ from tactomo_protocol import (
 )
 
 from tactomo.errors import ConfigError
+
+if TYPE_CHECKING:
+    from tactomo_models import SensorDescription
 
 KEPT_READINGS: Final = 32
 """Readings of each companion that a scan may be held against: those that come while it is taken."""

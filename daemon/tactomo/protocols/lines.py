@@ -9,13 +9,15 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from itertools import chain
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray
 
 from tactomo.protocols.interface import ForeignProtocol, Reading, Trouble
+
+if TYPE_CHECKING:
+    from tactomo_models import SensorDescription
 
 MAX_LINE_BYTES: Final = 65_536
 LONGEST_WORDS: Final = 200  # bytes of a banner's or a menu's line; what is longer was to be numbers

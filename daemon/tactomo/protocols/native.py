@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import TYPE_CHECKING
 
-from tactomo_models import SensorDescription
 from tactomo_protocol import (
     MAX_FRAME_BYTES,
     Command,
@@ -18,6 +18,9 @@ from tactomo_protocol import (
 )
 
 from tactomo.protocols.interface import KEPT_READINGS, PortProtocol, check_scan_fits
+
+if TYPE_CHECKING:
+    from tactomo_models import SensorDescription
 
 
 class NativeProtocol(PortProtocol):

@@ -17,12 +17,13 @@ import importlib
 from collections.abc import Callable
 from functools import cache
 from importlib.metadata import entry_points
-from typing import Any, Final
-
-from tactomo_models import SensorDescription
+from typing import TYPE_CHECKING, Any, Final
 
 from tactomo.errors import ConfigError
 from tactomo.protocols.interface import PortProtocol
+
+if TYPE_CHECKING:
+    from tactomo_models import SensorDescription
 
 GROUP: Final = "tactomo.protocols"
 NATIVE: Final = "tactomo"  # the protocol of `firmware_protocol/PROTOCOL.md`

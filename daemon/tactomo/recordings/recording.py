@@ -18,39 +18,31 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import IO, Annotated, Any, Final, NamedTuple, TypeVar
+from typing import IO, TYPE_CHECKING, Any, Final, NamedTuple
 from urllib.parse import quote
 
-import msgpack  # type: ignore[import-untyped]
 from mcap.records import Chunk as McapChunk
 from mcap.records import Footer, McapRecord, Message, Metadata
-from pydantic import BaseModel, Field, Strict, StrictBool, StrictInt, StrictStr
-from tactomo_client import MessageError, recording_file
+from tactomo_client import recording_file
 from tactomo_client.errors import RecordingError as ClientRecordingError
-from tactomo_client.messages import MAX_ENTRIES, array_from_wire
 from tactomo_client.recording_file import messages_beyond
-from tactomo_models import CalibrationError, Reference, SensorDescription, load_description
-from tactomo_models.calibration.calibration_file import PressureCalibration, parse_calibration
 from tactomo_models.errors import DescriptionError
-from tactomo_models.sensor.description_file import parse_description, shipped_descriptions
 from tactomo_protocol import Channel, Hello, Packet, Scan
 
 from tactomo.errors import ConfigError, RecordingError
 from tactomo.protocols import NATIVE, PortProtocol, protocol_named
-from tactomo.scans import Mark, ScanKey, Timing
+from tactomo.recordings.record_fields import read_reference_number
+from tactomo.scans import Mark
+
+if TYPE_CHECKING:  # `tactomo info` starts in half the time without
+    from tactomo_models import Reference, SensorDescription
 
 RECOVERED: Final = "tactomo-recovered"
-REFERENCE_ARRAYS: Final = ("magnitude", "structure", "magnitude_noise", "structure_noise")
-DRIFT_ARRAYS: Final = tuple(f"{c}_{what}" for what in ("drift", "creep") for c in Channel)
-"""Missing in recordings of daemons that did not follow drift."""
 REPLAY_SCHEME: Final = "replay"
 GIVE_DESCRIPTION: Final = "give the description's file by --description"
-_Record = TypeVar("_Record", bound=BaseModel)
 PREAMBLE_REACH_NS: Final = 2_000_000_000
 """How long a preamble is of use to a replay that begins after it: those of foreign protocols come
 every second, and one of ours is not needed by a port that knows its device."""
-OLD_METHODS: Final = {"hybrid": "auto"}
-"""Methods that marks of earlier versions name, and what they are called now."""
 
 
 class Chunk(NamedTuple):
@@ -82,6 +74,12 @@ class Origin:
 
         Raises RecordingError where it does neither: what it names by a path is not opened.
         """
+        from tactomo_models.sensor.description_file import (
+            load_description,
+            parse_description,
+            shipped_descriptions,
+        )
+
         try:
             if self.description_text:
                 return parse_description(self.description_text, "the recorded description")
@@ -209,6 +207,8 @@ class Recording:
 
     def marks(self) -> list[Mark]:
         """Return the dual scans that were reconstructed, each with what was new just before it."""
+        from tactomo.recordings.records import read_calibration, read_mark, read_reference
+
         marks: list[Mark] = []
         reference: Reference | None = None
         calibration: str | None = None
@@ -217,7 +217,7 @@ class Recording:
             if topic == "reference":
                 before, number = number, read_reference_number(message.data)
                 if number is None or number != before:  # else it is repeated
-                    reference = _read_reference(message.data)
+                    reference = read_reference(message.data)
             elif topic == "calibration":
                 calibration = read_calibration(message.data).text
             elif topic == "frame":
@@ -231,9 +231,11 @@ class Recording:
 
     def first_reference(self) -> Reference | None:
         """Return the reference in force when the recording began; None where none was taken."""
+        from tactomo.recordings.records import read_reference
+
         data = (m.data for topic, m in _messages(self.path) if topic == "reference")
         first = next(data, None)
-        return None if first is None else _read_reference(first)
+        return None if first is None else read_reference(first)
 
     def replay_urls(
         self,
@@ -331,124 +333,3 @@ def _our_errors() -> Iterator[None]:
         yield
     except ClientRecordingError as error:
         raise RecordingError(error.cause, error.next_step) from error
-
-
-def _read_reference(data: bytes) -> Reference:
-    record, fields = _read(_Reference, data), _fields(data)
-    if not fields.keys() >= set(REFERENCE_ARRAYS):
-        raise _malformed()
-    try:
-        arrays = {
-            name: None if fields.get(name) is None else array_from_wire(fields[name])
-            for name in REFERENCE_ARRAYS + DRIFT_ARRAYS
-        }
-    except MessageError as error:
-        raise _malformed() from error
-    at_rest = None if record.companions is None else tuple(record.companions.items())
-    return Reference(scans=record.scans, is_noise_measured=True, companions=at_rest, **arrays)
-
-
-class _Numbered(BaseModel):
-    number: StrictInt | None = None
-
-
-class _Reference(_Numbered):
-    scans: StrictInt
-    companions: (
-        dict[StrictStr, Annotated[float, Field(strict=True, allow_inf_nan=False)]] | None
-    ) = None
-
-
-def read_reference_number(data: bytes) -> int | None:
-    """Return which of its recording's references a message holds; None in old recordings."""
-    return _read(_Numbered, data).number
-
-
-class KeptCalibration(BaseModel):
-    """A pressure calibration that was put in force during a recording."""
-
-    number: StrictInt  # which of its recording's, from 1
-    text: StrictStr  # of its file; empty for none
-
-
-def read_calibration(data: bytes) -> KeptCalibration:
-    """Read a message of the topic ``calibration``; raise RecordingError where it is none."""
-    return _read(KeptCalibration, data)
-
-
-def calibration_text(calibration: PressureCalibration | None) -> str:
-    """Return a pressure calibration as recordings have it; empty for none."""
-    return "" if calibration is None else calibration.model_dump_json()
-
-
-def recorded_calibration(
-    text: str, source: str, description: SensorDescription
-) -> PressureCalibration | None:
-    """Return a pressure calibration that a recording holds; None where it does not fit here.
-
-    `source` names it in the log.
-    """
-    if not text:
-        return None
-    try:
-        found = parse_calibration(text, source)
-    except CalibrationError as error:
-        import structlog  # a fifth of the start of `tactomo info`
-
-        structlog.get_logger().warning("calibration_unused", detail=str(error))
-        return None
-    return None if found.subject.mismatch(found.subject.sensor, description) else found
-
-
-def read_mark(data: bytes) -> Mark:
-    """Read a message of the topic ``frame``; raise RecordingError where it is none."""
-    mark = _read(_Mark, data)
-    try:
-        keys = [ScanKey(Channel.of_number(c), counter, device) for c, counter, device in mark.scans]
-    except ValueError as error:
-        raise _malformed() from error
-    timing = None if mark.timing is None else Timing(*mark.timing)
-    return Mark(
-        tuple(keys),
-        OLD_METHODS.get(mark.tier, mark.tier),
-        mark.budget_ms,
-        None,
-        mark.reference,
-        mark.cold,
-        timing,
-        calibration_number=mark.calibration,
-    )
-
-
-class _Mark(BaseModel):
-    scans: list[tuple[StrictInt, StrictInt, StrictInt]]
-    tier: StrictStr
-    budget_ms: Annotated[float, Strict()] | None
-    reference: StrictInt | None = None
-    calibration: StrictInt = 0
-    cold: StrictBool = False
-    timing: tuple[StrictInt, StrictBool, StrictInt | None, StrictBool] | None = None
-
-
-def _read(kind: type[_Record], data: bytes) -> _Record:
-    try:
-        return kind.model_validate(_fields(data))
-    except ValueError as error:
-        raise _malformed() from error
-
-
-def _fields(data: bytes) -> dict[str, Any]:
-    try:
-        fields = msgpack.unpackb(data, max_array_len=MAX_ENTRIES, max_map_len=MAX_ENTRIES)
-    except Exception as error:  # msgpack raises of many kinds
-        raise _malformed() from error
-    if not isinstance(fields, dict):
-        raise _malformed()
-    return fields
-
-
-def _malformed() -> RecordingError:
-    return RecordingError(
-        "the recording holds records that tactomo does not write",
-        "another version or another program made it: record again",
-    )

@@ -24,7 +24,8 @@ from tactomo_models import Reference
 from tactomo_protocol import CompanionReading, Hello, Scan, encode
 
 from tactomo.errors import RecordingError
-from tactomo.recordings.recording import DRIFT_ARRAYS, REFERENCE_ARRAYS, REPLAY_SCHEME, Origin
+from tactomo.recordings.recording import REPLAY_SCHEME, Origin
+from tactomo.recordings.records import DRIFT_ARRAYS, REFERENCE_ARRAYS
 from tactomo.scans import Mark
 from tactomo.timing import wall_clock_ns
 

@@ -12,13 +12,8 @@ from tactomo_models.calibration.calibration_file import PressureCalibration
 from tactomo.errors import ConfigError, PortError
 from tactomo.plain import counted
 from tactomo.recordings.playback import Playback
-from tactomo.recordings.recording import (
-    REPLAY_SCHEME,
-    Recording,
-    calibration_text,
-    open_recording,
-    recorded_calibration,
-)
+from tactomo.recordings.recording import REPLAY_SCHEME, Recording, open_recording
+from tactomo.recordings.records import calibration_text, recorded_calibration
 from tactomo.scans import Delivery, Mark
 
 

@@ -73,8 +73,9 @@ from tactomo.imaging.kept_reference import KeptReference
 from tactomo.imaging.pipeline import Pipeline
 from tactomo.protocols import find_protocol, protocol_named
 from tactomo.recordings.recorder import Recorder
-from tactomo.recordings.recording import Origin, calibration_text
+from tactomo.recordings.recording import Origin
 from tactomo.recordings.recording_writer import Entry
+from tactomo.recordings.records import calibration_text
 from tactomo.recordings.replay import Replay, read_replay, without_calibrations
 from tactomo.running import Running, announced
 from tactomo.service.status import Status

@@ -15,8 +15,9 @@ from recorded_grasp import write_grasp
 from tactomo.config import load_config
 from tactomo.errors import ConfigError, PortError, RecordingError
 from tactomo.imaging import frame_marks
-from tactomo.recordings.recording import open_recording, read_mark
+from tactomo.recordings.recording import open_recording
 from tactomo.recordings.recording_writer import pack_mark, write_recording
+from tactomo.recordings.records import read_mark
 from tactomo.scans import Mark, ScanKey
 from tactomo.service import daemon
 from tactomo.service.daemon import Daemon
