@@ -24,12 +24,12 @@ from tactomo_models.scans.reference import Reference
 from tactomo_models.scans.repeats import Repeats
 from tactomo_models.scene.contacts import Contact
 from tactomo_models.scene.pressure import PressureCurve
-from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.sensor.description import SensorDescription
 
 Progress = Callable[[int, int], None]
 
 IMAGES = ("map", "pressure_kpa", "structure")
+NUMBERS = ("misfit", "confidence", "force_n", "force_sigma_n")
 
 
 def _contact_row(frame: int, contact: Contact) -> dict[str, Any]:
@@ -54,7 +54,7 @@ CONTACT_TYPES = {
 VECTORS = dict.fromkeys(("contact_position_m", "contact_normal"), (3,))
 TYPES = {
     **dict.fromkeys(IMAGES, np.float32),
-    **dict.fromkeys(("misfit", "confidence", "force_n", "force_sigma_n", "seconds"), np.float64),
+    **dict.fromkeys((*NUMBERS, "seconds"), np.float64),
     "flags": np.uint32,
     **CONTACT_TYPES,
 }
@@ -144,7 +144,8 @@ def reconstruct_file(
             companions = [(name, float(each[index])) for name, each in readings.items()]
             compared = reconstructor.compare(*taken.values(), companions=companions)
             frame = reconstructor.solve(compared)
-            arrays.append({"seconds": time.perf_counter() - start, **_frame_row(frame)})
+            row = {"seconds": time.perf_counter() - start, "flags": int(frame.flags)}
+            arrays.append(row | {name: getattr(frame, name) for name in (*IMAGES, *NUMBERS)})
             for contact in frame.contacts:
                 arrays.append(_contact_row(index, contact))
             failed += bool(frame.failure)
@@ -315,8 +316,3 @@ def checked(source: Path, name: str, array: Any, shape: tuple[int | None, ...]) 
             f"{wanted}{several} are needed"
         )
     return np.asarray(bounded(array), dtype=np.float64)
-
-
-def _frame_row(frame: Reconstruction) -> dict[str, Any]:
-    names = (*IMAGES, "misfit", "confidence", "force_n", "force_sigma_n")
-    return {**{name: getattr(frame, name) for name in names}, "flags": int(frame.flags)}

@@ -41,9 +41,10 @@ def draw_outcomes(outcomes: Sequence[Outcome], output: Path) -> None:
     size = (8.5 * len(kinds), 2.3 * min(ROWS, len(by_icc)) + 0.5)
     figure = Figure(figsize=size, layout="constrained")
     halves: Any = figure.subfigures(1, len(kinds), squeeze=False)[0]
-    size_mm = _size_mm(outcomes[0].case.description)
+    sensor = outcomes[0].case.description
+    size_mm = " × ".join(f"{np.ptp(m) * 1e3:.0f}" for m in (sensor.map_x_m, sensor.map_y_m))
     for half, (kind, chosen) in zip(halves, kinds.items(), strict=True):
-        half.suptitle(f"{kind} (maps of {size_mm})")
+        half.suptitle(f"{kind} (maps of {size_mm} mm)")
         grid = half.subplots(len(chosen), 4, squeeze=False)
         for axes, outcome in zip(grid, chosen, strict=True):
             _draw_outcome(axes, outcome)
@@ -100,7 +101,9 @@ def draw_overview(
             icc_shown = f"{icc[row, column]:.2f}" if scores else ""
             axes.text(column - 0.44, row, icc_shown, va="center", fontsize=8, color=ink)
             if silent := sum(one.bad and not one.warned for one in scores):
-                _mark(axes, column + 0.44, row, f"{silent}/{len(scores)}")
+                red = {"facecolor": "tab:red", "edgecolor": "none", "pad": 1.5}
+                words = axes.text(column + 0.44, row, f"{silent}/{len(scores)}", va="center")
+                words.set(ha="right", fontsize=8, color="white", bbox=red)
     figure.colorbar(image, ax=axes, label="mean ICC with the truth", aspect=30)
     legend = (
         "Red: maps with an ICC below 0.7 that no flag told to distrust, of all maps. "
@@ -108,15 +111,6 @@ def draw_overview(
     )
     figure.supxlabel(textwrap.fill(legend, int(13 * size[0])), fontsize=8)
     save_figure(figure, output, dpi=DPI)
-
-
-def _mark(axes: Any, x: float, y: float, words: str) -> None:
-    box = {"facecolor": "tab:red", "edgecolor": "none", "pad": 1.5}
-    axes.text(x, y, words, va="center", ha="right", fontsize=8, color="white", bbox=box)
-
-
-def _size_mm(sensor: SensorDescription) -> str:
-    return f"{np.ptp(sensor.map_x_m) * 1e3:.0f} × {np.ptp(sensor.map_y_m) * 1e3:.0f} mm"
 
 
 def _show(panel: Any, image: NDArray[Any] | None, sensor: SensorDescription, highest: float) -> Any:

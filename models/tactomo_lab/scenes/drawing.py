@@ -73,18 +73,21 @@ def draw_indenter(
     *,
     profile: Profile = "flat",
     pressure_kpa: tuple[float, float] = PRESSURE_KPA,  # of its peak
-    scale: float = 1.0,  # on `HALF_AXIS_M`
+    half_axis_m: tuple[float, float] = HALF_AXIS_M,  # least and most of its longer one
+    ring_half_axis_m: float = RING_HALF_AXIS_M,  # the least of a ring
+    aspect: float = MAX_ASPECT,  # at most
+    scale: float = 1.0,  # on lengths
 ) -> Press:
     """Draw an indenter of a shape anywhere on the sheet, turned any way."""
-    least, most = HALF_AXIS_M
-    least = RING_HALF_AXIS_M if shape == "ring" else least
+    least, most = half_axis_m
+    least = ring_half_axis_m if shape == "ring" else least
     long = rng.uniform(least, most)
     return Press(
         x_m=rng.uniform(-0.5, 0.5) * description.width_m,
         y_m=rng.uniform(-0.5, 0.5) * description.height_m,
         pressure_kpa=rng.uniform(*pressure_kpa),
         radius_m=scale * long,
-        radius_y_m=scale * rng.uniform(max(least, long / MAX_ASPECT), long),
+        radius_y_m=scale * rng.uniform(max(least, long / aspect), long),
         angle_rad=rng.uniform(0, np.pi),
         shape=shape,
         profile=profile,

@@ -290,12 +290,13 @@ def score_contact(
     full = full_range(description)
     is_above = found.pressure_range is PressureRange.ABOVE
     is_bare = not np.isfinite(found.peak_sigma_kpa)
+    peak_kpa = found.peak_kpa if np.isfinite(found.peak_kpa) else found.pressure_kpa
     return replace(
         known,
         centre_error_mm=1e3 * float(np.hypot(found.x_m - true.x_m, found.y_m - true.y_m)),
         magnitude_error=(found.magnitude - true.magnitude) / full,
         magnitude_sigma=found.magnitude_sigma / full,
-        peak_error=_peak_kpa(found) / true.pressure_kpa - 1,
+        peak_error=peak_kpa / true.pressure_kpa - 1,
         x_error_sigmas=_sigmas(found.x_m - true.x_m, found.x_sigma_m),
         y_error_sigmas=_sigmas(found.y_m - true.y_m, found.y_sigma_m),
         area_error_sigmas=_sigmas(found.area_m2 - true.area_m2, found.area_sigma_m2),
@@ -303,10 +304,6 @@ def score_contact(
         above=is_above,
         unbounded=is_bare and (is_above or bool(np.isposinf(found.max_kpa))),
     )
-
-
-def _peak_kpa(found: Contact) -> float:
-    return found.peak_kpa if np.isfinite(found.peak_kpa) else found.pressure_kpa
 
 
 def _sigmas(error: float, sigma: float) -> float:

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 from tactomo_models.arrays import FloatArray
-from tactomo_models.scene.press import Press, Profile, Shape
+from tactomo_models.scene.press import Press, Shape
 from tactomo_models.scene.pressure import PressureCurve
 from tactomo_models.sensor.description import SensorDescription
 
@@ -117,35 +117,23 @@ def _any_press(
 ) -> Press:
     shape = tuple(ROBUST_SHAPES)[rng.choice(len(ROBUST_SHAPES), p=tuple(ROBUST_SHAPES.values()))]
     shape = "ellipse" if soft else shape
-    least, most = half_axis_m
-    least = RING_HALF_AXIS_M if shape == "ring" else least
-    scale = scale_of(description)
-    least, most = scale * least, scale * most
-    long = rng.uniform(least, most)
     shares = [share for share, _, _ in ROBUST_PRESSURE_KPA]
     _, *pressures = ROBUST_PRESSURE_KPA[rng.choice(len(shares), p=shares)]
-    low, high = (_pressure_scale(description) * pressure for pressure in pressures)
     domed = soft or (shape == "ellipse" and rng.random() < DOMES / ROBUST_SHAPES["ellipse"])
-    profile: Profile = "dome" if domed else "flat"
-    return Press(
-        *_anywhere(description, rng),
-        pressure_kpa=rng.uniform(low, high) * (DOME_PEAK if domed else 1.0),
-        radius_m=long,
-        radius_y_m=rng.uniform(max(least, long / MAX_ASPECT), long),
-        angle_rad=rng.uniform(0, np.pi),
-        shape=shape,
-        profile=profile,
-    )
-
-
-def _pressure_scale(description: SensorDescription) -> float:
     assert description.magnitude is not None
-    return description.magnitude.response.pressure_kpa[-1] / END_KPA
-
-
-def _anywhere(description: SensorDescription, rng: np.random.Generator) -> tuple[float, float]:
-    x, y = rng.uniform(-0.5, 0.5, 2)
-    return x * description.width_m, y * description.height_m
+    scale = description.magnitude.response.pressure_kpa[-1] / END_KPA
+    low, high = (scale * kpa * (DOME_PEAK if domed else 1.0) for kpa in pressures)
+    return draw_indenter(
+        description,
+        rng,
+        shape,
+        profile="dome" if domed else "flat",
+        pressure_kpa=(low, high),
+        half_axis_m=half_axis_m,
+        ring_half_axis_m=RING_HALF_AXIS_M,
+        aspect=MAX_ASPECT,
+        scale=scale_of(description),
+    )
 
 
 def _draw_sheet(

@@ -66,8 +66,13 @@ class Examination:
         self.electrode_noise = np.array([np.median(excess[t]) for t in self.wiring.electrodes])
         of_mean = self.noise / np.sqrt(self.count)
         # (M,) voltages that the instrument reads at all
-        self.sought = _sought(wiring, layout, transfer)
-        self.order = self._order(layout, transfer, of_mean)  # which leads are not where they belong
+        self.sought = np.ones(len(layout.pairs.drive), dtype=bool)
+        if isinstance(layout, SensorDescription) and transfer is not None:
+            self.sought = Polarity(layout, wiring, scan_voltages(layout, transfer)).certain
+            # which leads are not where they belong
+            self.order = find_order(layout, transfer, self.mean, of_mean, self.sought)
+        else:
+            self.order = Order((), 0, _likes(layout, self.mean))
         expected = self.order.expected
         if (scans >= 0).all():  # a device that reports sizes alone
             expected = np.abs(expected)
@@ -80,11 +85,6 @@ class Examination:
         self.states = self._states(layout.electrode_count, excess, expected)
         # (M,) voltages that no bad electrode has part in; all where most are bad
         self.good = self._good()
-
-    def _order(self, layout: Layout, transfer: FloatArray | None, noise: FloatArray) -> Order:
-        if isinstance(layout, SensorDescription) and transfer is not None:
-            return find_order(layout, transfer, self.mean, noise, self.sought)
-        return Order((), 0, _likes(layout, self.mean))
 
     def _each(self, scans: FloatArray, contrast: float) -> list[tuple[Flag, tuple[int, ...]]]:
         """What is wrong with each single scan, by laws that hold whatever presses."""
@@ -120,13 +120,6 @@ class Examination:
         good = self.sought & ~self.wiring.electrodes[bad].any(axis=0)
         few = len(bad) > BROKEN_SHARE * len(self.states)
         return self.sought if few or not good.any() else good
-
-
-def _sought(wiring: Wiring, layout: Layout, transfer: FloatArray | None) -> BoolArray:
-    """Voltages (M,) that the instrument reads at all."""
-    if not isinstance(layout, SensorDescription) or transfer is None:
-        return np.ones(len(layout.pairs.drive), dtype=bool)
-    return Polarity(layout, wiring, scan_voltages(layout, transfer)).certain
 
 
 def noise_about_line(scans: FloatArray) -> FloatArray:

@@ -85,8 +85,8 @@ def describe(
     moved = shapely.transform(model.polygon, lambda points: scale * (points - origin))
     polygon, spare_mm = _simplified(moved)
     corners = [_listed(ring.coords[:-1]) for ring in (polygon.exterior, *polygon.interiors)]
-    if np.any(offset := _middle(corners[0])):  # of rounding
-        corners = [_listed(np.array(each) - offset) for each in corners]
+    offset = (np.min(corners[0], axis=0) + np.max(corners[0], axis=0)) / 2  # of rounding
+    corners = [_listed(np.array(each) - offset) for each in corners]
     places = _listed(scale * (model.centres - origin))
     deep = shapely.distance(polygon.boundary, shapely.points(places)) > 5e-4 * length_mm
     x_mm, y_mm = 1e3 * scale * origin
@@ -142,10 +142,6 @@ def _simplified(polygon: shapely.Polygon) -> tuple[shapely.Polygon, float]:
         if shapely.get_num_coordinates(simple) <= MAX_CORNERS:
             return simple, spare_mm
         spare_mm *= 2
-
-
-def _middle(corners: list[list[float]]) -> FloatArray:
-    return np.asarray((np.min(corners, axis=0) + np.max(corners, axis=0)) / 2)
 
 
 def _listed(points: FloatArray) -> list[list[float]]:

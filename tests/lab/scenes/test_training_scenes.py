@@ -63,7 +63,7 @@ def test_no_training_scene_is_one_of_the_evaluations(
 def test_another_sensor_gets_scenes_of_its_own_size(
     small: SensorDescription, robust_scenes: list[TrainingScene]
 ) -> None:
-    scenes = [draw_scene(small, 0, number) for number in range(60)]
+    scenes = [draw_scene(small, 0, number) for number in range(120)]
     half_axes = [press.radius_m for scene in scenes for press in scene.presses]
     assert max(half_axes) < 0.05 / 0.15 * 0.023
     assert {len(scene.presses) for scene in scenes} >= {1, 2, 3, 4}
