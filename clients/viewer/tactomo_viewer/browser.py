@@ -38,20 +38,16 @@ DAEMON_COMMANDS: Mapping[str, tuple[frozenset[str], float]] = {
 PRESS_ARGUMENTS = ("x_mm", "y_mm", "pressure_kpa", "radius_mm", "shape")
 
 
+@dataclasses.dataclass(eq=False)
 class Browser:
     """One websocket. `wake` it whenever there may be something new to send."""
 
-    def __init__(
-        self,
-        socket: web.WebSocketResponse,
-        feed: Feed,
-        daemon: aio.Control | None,
-        twin: aio.Control | None,
-    ) -> None:
-        self._socket = socket
-        self._feed = feed
-        self._daemon = daemon
-        self._twin = twin
+    _socket: web.WebSocketResponse
+    _feed: Feed
+    _daemon: aio.Control | None
+    _twin: aio.Control | None
+
+    def __post_init__(self) -> None:
         self._name = uuid.uuid4().hex[:8]
         self._changed = asyncio.Event()
         self._unconfirmed = 0

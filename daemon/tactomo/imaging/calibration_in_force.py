@@ -6,6 +6,7 @@ For use by the pipeline thread; others may read `in_force`.
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from tactomo_models import Reconstructor, Reference, SensorDescription
@@ -27,29 +28,24 @@ class _Foreign(NamedTuple):
     until: str  # what holds until then
 
 
+@dataclass(eq=False)
 class CalibrationInForce:
     """The pressure calibration in force; the reconstructor's curve and the recording follow it."""
 
-    def __init__(
-        self,
-        # the sensor, whose own curve is used where there is no calibration
-        description: SensorDescription,
-        reconstructor: Reconstructor,  # is given the curve
-        recorder: Recorder,  # told of each new calibration
-        on_event: OnEvent,  # told of a calibration that is another device's
-        calibration: PressureCalibration | None,  # the sensor's own; None where there is none
-        taught: TaughtSkin | None,  # what the sensor was taught; None where nothing was
-    ) -> None:
+    # the sensor, whose own curve is used where there is no calibration
+    _description: SensorDescription
+    _reconstructor: Reconstructor  # is given the curve
+    _recorder: Recorder  # told of each new calibration
+    _on_event: OnEvent  # told of a calibration that is another device's
+    _own: PressureCalibration | None  # the sensor's own; None where there is none
+    _own_taught: TaughtSkin | None  # what the sensor was taught; None where nothing was
+
+    def __post_init__(self) -> None:
         # the calibration that is used; None for the description's curve
         self.in_force: PressureCalibration | None = None
         # the teaching that is used; None where the physics alone locates
         self.taught: TaughtSkin | None = None
-        self._description = description
-        self._reconstructor = reconstructor
-        self._recorder = recorder
-        self._on_event = on_event
-        self._own, self._own_taught = calibration, taught
-        self.text = calibration_text(calibration)  # of the sensor's own, in force or not
+        self.text = calibration_text(self._own)  # of the sensor's own, in force or not
         self._reference: Reference | None = None
         self.device_ids: frozenset[str] = frozenset()  # of those that have spoken
         self._refused: list[_Foreign] = []

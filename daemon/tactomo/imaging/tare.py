@@ -15,7 +15,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -50,43 +50,27 @@ class _Taken(NamedTuple):
     tare: Future[Tare]
 
 
+@dataclass(eq=False)
 class Taring:
     """Takes references for one sensor. For use by the pipeline thread.
 
     Its own thread finds how sheets were made: it is handed a reference, and hands back a future.
-
-    Args:
-        scans: dual scans for each reference.
-        channels: those of the sensor.
-        frame_rate: how often frames come.
-        take: finds what a reference tells; for any thread.
-        waits: whether frames wait for that, so that each is made against what was taken before.
-        put_in_force: called with a tare, whether somebody asked for it, and how many contacts were
-            shown meanwhile; returns whether it is in force, and not an older one.
-        fall_back: called with why none was taken while there is none; returns whether an older
-            one is in force now.
-        on_event: told what a tare became.
     """
 
-    def __init__(
-        self,
-        scans: int,
-        channels: Collection[Channel],
-        frame_rate: Rate,
-        take: Callable[[Reference], Tare],
-        waits: bool,
-        put_in_force: Callable[[Tare, bool, int], bool],
-        fall_back: Callable[[str], bool],
-        on_event: OnEvent,
-    ) -> None:
-        self._scans = scans
-        self._channels = channels
-        self._frame_rate = frame_rate
-        self._take = take
-        self._waits = waits
-        self._put_in_force = put_in_force
-        self._fall_back = fall_back
-        self._on_event = on_event
+    _scans: int  # dual scans for each reference
+    _channels: Collection[Channel]  # those of the sensor
+    _frame_rate: Rate  # how often frames come
+    _take: Callable[[Reference], Tare]  # finds what a reference tells; for any thread
+    # whether frames wait for that, so that each is made against what was taken before
+    _waits: bool
+    # called with a tare, whether somebody asked for it, and how many contacts were shown meanwhile;
+    # returns whether it is in force, and not an older one
+    _put_in_force: Callable[[Tare, bool, int], bool]
+    # called with why none was taken while there is none; returns whether an older one is in force
+    _fall_back: Callable[[str], bool]
+    _on_event: OnEvent  # told what a tare became
+
+    def __post_init__(self) -> None:
         self.has_reference = False  # then a tare that is refused is not begun again
         self._tare: _Scans | None = None
         self._deadline_s = 0.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -14,26 +15,20 @@ MAX_QUEUED_BYTES: Final = 64 << 20
 ENTRY_BYTES: Final = 300  # what an entry takes beside its data
 
 
+@dataclass(eq=False)
 class ActiveRecording:
     """A recording in progress: any thread may fill its queue, the recorder's thread empties it."""
 
-    def __init__(
-        self,
-        number: int,
-        path: Path,
-        writer: RecordingWriter,
-        with_maps: bool,
-        calibration: str,
-        previous: ActiveRecording | None = None,
-    ) -> None:
-        self.number = number  # tells it from the daemon's other recordings; rises from 1
-        self.path = path
-        self.with_maps = with_maps
-        # the pressure calibration that the file's metadata tell, as text
-        self.calibration = calibration
-        # the file before it, until the recorder's thread has closed that; it gets the ports' bytes,
-        # too, as long as the pipeline's thread has not `come_over` to this one
-        self.previous = previous
+    number: int  # tells it from the daemon's other recordings; rises from 1
+    path: Path
+    _writer: RecordingWriter
+    with_maps: bool
+    calibration: str  # the pressure calibration that the file's metadata tell, as text
+    # the file before it, until the recorder's thread has closed that; it gets the ports' bytes,
+    # too, as long as the pipeline's thread has not `come_over` to this one
+    previous: ActiveRecording | None
+
+    def __post_init__(self) -> None:
         self.come_over = threading.Event()
         self.references = 0  # how many references were added; the pipeline's thread counts
         self.calibrations = 0  # how many pressure calibrations were added, likewise
@@ -42,7 +37,6 @@ class ActiveRecording:
         self.is_overflowed = False  # the queue was full once, and nothing is taken any more
         self.is_empty = True  # nothing was written yet; written by the recorder's thread
         self._begin_s = time.monotonic()
-        self._writer = writer
         self._lock = threading.Lock()
         self._entries: list[Entry] = []  # this and the next three under the lock
         self._queued_bytes = 0

@@ -61,31 +61,22 @@ class Sample:
     readings: Sequence[CompanionReading]
 
 
+@dataclass(eq=False)
 class Firmware:
-    """The device behind its lines. For use by one thread.
+    """The device behind its lines. For use by one thread."""
 
-    `clock` has the seconds since power-up; at such a time `sample` starts computing voltages, and
-    `read` has what the companions read then, at the scan of that counter.
-    """
+    hello: Hello  # as of all channels and the rate at first
+    ports: Sequence[Port]
+    _sample: Callable[[float], Future[Voltages]]  # starts computing the voltages of a time
+    _converter: Converter
+    _clock: Callable[[], float]  # the seconds since power-up
+    # what the companions read at a time, at the scan of that counter
+    _read: Callable[[float, int], Sequence[CompanionReading]]
 
-    def __init__(
-        self,
-        hello: Hello,  # as of all channels and the rate at first
-        ports: Sequence[Port],
-        sample: Callable[[float], Future[Voltages]],
-        converter: Converter,
-        clock: Callable[[], float],
-        read: Callable[[float, int], Sequence[CompanionReading]] = lambda _, __: (),
-    ) -> None:
-        self.hello = hello
-        self.ports = tuple(ports)
-        self.rate_hz = hello.scan_rate_hz
+    def __post_init__(self) -> None:
+        self.rate_hz = self.hello.scan_rate_hz
         self.counter = 0
         self.late = 0
-        self._sample = sample
-        self._read = read
-        self._converter = converter
-        self._clock = clock
         self._pending: Sample | None = None
         self._next_sample_s = 0.0
         self._next_hello_s = 0.0

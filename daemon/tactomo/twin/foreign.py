@@ -89,7 +89,7 @@ class ForeignFirmware(Firmware):
         converter: Converter,
         clock: Callable[[], float],
     ) -> None:
-        super().__init__(hello, [port], sample, converter, clock)
+        super().__init__(hello, [port], sample, converter, clock, lambda _, __: ())
         self._emulator = emulator
         self._port = port
         self._waiting: deque[bytes] = deque()
