@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -22,24 +23,20 @@ MAX_READ_BYTES: Final = 65_536
 """Taken at once at most, so that a flood of noise cannot keep the thread from its other duties."""
 
 
+@dataclass(eq=False)
 class Connection:
     """One port, open or waited for."""
 
-    def __init__(
-        self,
-        url: str,
-        baud: int,
-        on_event: OnEvent,
-        root: Path = ROOT,
-    ) -> None:
-        self.url = url
+    url: str
+    _baud: int
+    _on_event: OnEvent
+    _root: Path = ROOT
+
+    def __post_init__(self) -> None:
         self.is_open = False  # whether the device is there at present
         self.problem = ""  # why it is not open, for people; empty while it is
         # an FTDI adapter's, as of the last opening; None for others
         self.latency_timer_ms: int | None = None
-        self._baud = baud
-        self._root = root
-        self._on_event = on_event
         self.has_ended, self.moved = False, 0  # a device's stream neither ends nor moves
         self._serial: serial.Serial | None = None
 

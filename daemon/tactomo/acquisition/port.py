@@ -13,6 +13,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from typing import Final
 
 from tactomo_models import SensorDescription
@@ -70,27 +71,24 @@ TROUBLES: Final = {
 """The event of a device in each state of trouble, and what to do."""
 
 
+@dataclass(eq=False)
 class PortReader(Worker):
     """One port. `open` it, `start` its thread, `stop` it."""
 
-    def __init__(
-        self,
-        index: int,  # its number among the sensor's ports
-        url: str,  # a device's path or a pyserial URL
-        baud: int,  # of a real UART
-        protocol: PortProtocol,  # what its device speaks; it belongs to the thread from `start` on
-        description: SensorDescription,  # the sensor that the device must fit
-        device_ids: Collection[str],  # those that may speak here; any where it is empty
-        recorder: Recorder,  # gets every byte while it records
-        deliver: Callable[[Delivery], None],  # called by the thread with what each read brought
-        on_event: OnEvent,  # told what happens
-        playback: Playback | None = None,  # the replay's time, where the port replays
-        # which port carries a channel, of all ports of the sensor; by itself where it is None
-        carriers: dict[Channel, PortReader] | None = None,
-    ) -> None:
-        super().__init__(f"port-{index}")
-        self.index = index
-        self.url = url
+    index: int  # its number among the sensor's ports
+    url: str  # a device's path or a pyserial URL
+    _baud: int  # of a real UART
+    protocol: PortProtocol  # what its device speaks; it belongs to the thread from `start` on
+    _description: SensorDescription  # the sensor that the device must fit
+    _device_ids: Collection[str]  # those that may speak here; any where it is empty
+    _recorder: Recorder  # gets every byte while it records
+    _deliver: Callable[[Delivery], None]  # called by the thread with what each read brought
+    _on_event: OnEvent  # told what happens
+    _playback: Playback | None  # the replay's time, where the port replays
+    _carriers: dict[Channel, PortReader]  # which port carries a channel
+
+    def __post_init__(self) -> None:
+        super().__init__(f"port-{self.index}")
         self.bytes_read = 0  # since the start, over all connections
         # scans that cannot be used: before the first hello, of a device that does not fit the
         # sensor, of another length or of a channel that the sensor does not have
@@ -99,21 +97,14 @@ class PortReader(Worker):
         self.refusal = ""  # why this device's scans are not used; empty when they are
         self.reopened = 0  # how often the port was opened again because the device did not speak
         self.clock = DeviceClock()  # the device's, by which its scans are dated
-        self._companions = CompanionLog(description)
+        self._companions = CompanionLog(self._description)
         self.has_ended = False  # whether the replay behind the port is at its end
-        self._baud = baud
-        self._description = description
-        self._device_ids = device_ids
-        self._recorder = recorder
-        self._deliver = deliver
-        self._on_event = on_event
-        self._carriers = {} if carriers is None else carriers
-        self._is_replay = playback is not None
         self.connection = (
-            Connection(url, baud, on_event) if playback is None else ReplaySource(url, playback)
+            Connection(self.url, self._baud, self._on_event)
+            if self._playback is None
+            else ReplaySource(self.url, self._playback)
         )
-        self._liveness = Liveness(protocol.says_hello, protocol.patience_s)
-        self.protocol = protocol
+        self._liveness = Liveness(self.protocol.says_hello, self.protocol.patience_s)
         self._pass = 0  # of the replay
         self._recording = 0  # number of the recording that has the last chunk
         self._preamble_s = 0.0  # when a recording was last given one
@@ -186,7 +177,7 @@ class PortReader(Worker):
             self._take(data, realtime_ns, monotonic_ns, source.clock_ns(monotonic_ns))
         if source.has_ended and not self.has_ended:
             self._end()
-        if not self._is_replay and self.connection.is_open:
+        if self._playback is None and self.connection.is_open:
             self._attend(monotonic_ns * 1e-9)
 
     def _wait_for_device(self) -> None:
@@ -265,7 +256,7 @@ class PortReader(Worker):
             self._deliver(
                 Delivery(self.index, clock_ns, tuple(scans), self.hello, replay_pass=self._pass)
             )
-        if not self._is_replay:
+        if self._playback is None:
             self._send(self.protocol.replies())
         self._tell_corrupt()
         self._tell_faulty(now_s)

@@ -55,23 +55,17 @@ class KnownSkin:
         return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(self.realtime_ns // 1_000_000_000))
 
 
+@dataclass(eq=False)
 class KeptReference:
     """Reads and keeps one sensor's last reference. For use by the pipeline thread."""
 
-    def __init__(
-        self,
-        sensor: str,  # its name
-        # what it is made of; a reference of another one is not used
-        description: SensorDescription,
-        recorder: Recorder,  # its thread writes, so that a stuck disk holds up nobody
-        on_event: OnEvent,  # told when it cannot be kept
-    ) -> None:
-        self.is_unreadable = False  # whether there is one that could not be read
-        self._path = reference_path(sensor)
-        self._description = description
-        self._recorder = recorder
-        self._on_event = on_event
-        self._next_s = 0.0
+    _path: Path  # of its file
+    # what the sensor is made of; a reference of another one is not used
+    _description: SensorDescription
+    _recorder: Recorder  # its thread writes, so that a stuck disk holds up nobody
+    _on_event: OnEvent  # told when it cannot be kept
+    is_unreadable = False  # whether there is one that could not be read
+    _next_s = 0.0
 
     def read(self, device_ids: Collection[str]) -> KnownSkin | None:
         """Return what is kept, if it is of this description and of these devices.

@@ -16,6 +16,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from dataclasses import dataclass
 from typing import Any, Final
 
 from tactomo_models.calibration.calibration_file import PressureCalibration
@@ -44,42 +45,35 @@ ZERO_PERIOD_S: Final = 10.0
 """How often devices are asked to zero their counters, while that does not bring them in step."""
 
 
+@dataclass(eq=False)
 class Pipeline(Worker):
     """`start` it, `deliver` to it, `stop` it."""
 
-    def __init__(
-        self,
-        imaging: Imaging,
-        channels: tuple[Channel, ...],
-        ports: int,
-        sync_wait_ns: int,
-        is_lossless: bool,
-        replay: Replay | None,
-        zero_counters: Callable[[], None],
-        on_event: OnEvent,
-    ) -> None:
+    _imaging: Imaging
+    _channels: tuple[Channel, ...]
+    _ports: int
+    _sync_wait_ns: int
+    _is_lossless: bool
+    _replay: Replay | None
+    _zero_counters: Callable[[], None]
+    _on_event: OnEvent
+
+    def __post_init__(self) -> None:
         super().__init__("pipeline")
         self.delivered_ns = 0  # when the newest scan was, monotonic; 0 before the first
         self.incomplete = 0  # dual scans without a channel that had come before, or is lost
-        self.scan_rates = {channel: Rate() for channel in channels}
+        self.scan_rates = {channel: Rate() for channel in self._channels}
         # set while every replayed port is at its end, once what came of it was published
         self.finished = threading.Event()
-        self._imaging = imaging
-        self._channels = channels
-        self._ports = ports
-        self._replay = replay
+        replay = self._replay
         self._is_exact = replay is not None and replay.playback.is_exact
-        self._is_lossless = is_lossless
-        self._sync_wait_ns = sync_wait_ns
         self.sync = self._new_sync()
         self.skew = Skew()
-        self.wall_clock = WallClock(on_event)
-        self._zero_counters = zero_counters
+        self.wall_clock = WallClock(self._on_event)
         self._zero_limit = RateLimit(ZERO_PERIOD_S)
-        self._on_event = on_event
         # Scans: each port's thread counts its own; the port threads share a lock for what is
         # discarded because this thread did not come round to it for seconds.
-        self._received: list[Counter[Channel]] = [Counter() for _ in range(ports)]
+        self._received: list[Counter[Channel]] = [Counter() for _ in range(self._ports)]
         self._discarded: Counter[Channel] = Counter()
         self._joined = self._used = self._left_out = 0
         self._ready: deque[DualScan] = deque()  # to be made into frames now
@@ -88,7 +82,7 @@ class Pipeline(Worker):
         self._prepared_for: int | None = None  # when the reference of the frames was taken
         self._announced: dict[int, Hello] = {}  # what each port's device says of itself
         self._begun: set[Channel] = set()  # channels that have been in a dual scan
-        self._replay_clock = None if replay is None else ReplayClock(ports, replay.is_paced)
+        self._replay_clock = None if replay is None else ReplayClock(self._ports, replay.is_paced)
         self._deliveries: queue.Queue[Delivery | None] = queue.Queue(
             QUEUED_DELIVERIES if replay is None else QUEUED_OF_REPLAY
         )

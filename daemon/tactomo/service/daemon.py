@@ -69,7 +69,7 @@ from tactomo.endpoint import allow_connections
 from tactomo.errors import CommandError, ConfigError
 from tactomo.events import OF_THE_SKIN, RECORDED, EventBook
 from tactomo.imaging.imaging import Imaging
-from tactomo.imaging.kept_reference import KeptReference
+from tactomo.imaging.kept_reference import KeptReference, reference_path
 from tactomo.imaging.pipeline import Pipeline
 from tactomo.protocols import find_protocol, protocol_named
 from tactomo.recordings.recorder import Recorder
@@ -181,7 +181,9 @@ class Daemon:
             config.baseline,
             None
             if replay is not None or reconstructor is not None
-            else KeptReference(config.name, description, self._recorder, self._on_event),
+            else KeptReference(
+                reference_path(config.name), description, self._recorder, self._on_event
+            ),
             self._recorder,
             self._publisher,
             self._on_event,
@@ -197,9 +199,8 @@ class Daemon:
             self._on_event,
         )
         # A channel is one port's. In an exact replay the marks say whose each scan is.
-        carriers: dict[Channel, PortReader] | None = (
-            None if replay is not None and replay.marks else {}
-        )
+        is_exact = replay is not None and bool(replay.marks)
+        carriers: dict[Channel, PortReader] = {}
         self._ports = [
             PortReader(
                 index,
@@ -211,8 +212,8 @@ class Daemon:
                 self._recorder,
                 self._pipeline.deliver,
                 self._on_event,
-                playback=self.playback,
-                carriers=carriers,
+                self.playback,
+                {} if is_exact else carriers,
             )
             for index, url in enumerate(config.ports)
         ]
@@ -227,8 +228,8 @@ class Daemon:
                 "reload_calibration": lambda _: self._reload_calibration(),
                 "replay": self._steer_replay,
             },
-            on_idle=self._check,
-            on_event=self._on_event,
+            self._check,
+            self._on_event,
         )
         self._status = Status(
             description,

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Annotated, Any, Final, NamedTuple
 
@@ -136,21 +137,18 @@ class _Unread(NamedTuple):
     until_s: float
 
 
+@dataclass(eq=False)
 class Control(Worker):
     """Answers commands. `open` it, `start` its thread, `stop` it."""
 
-    def __init__(
-        self,
-        # one for each of COMMANDS; called by the thread with the checked arguments
-        handlers: Mapping[str, Handler],
-        on_idle: Callable[[], None],  # called by the thread several times a second
-        on_event: OnEvent,  # told of connections that were cut
-    ) -> None:
+    # one for each of COMMANDS; called by the thread with the checked arguments
+    _handlers: Mapping[str, Handler]
+    _on_idle: Callable[[], None]  # called by the thread several times a second
+    _on_event: OnEvent  # told of connections that were cut
+
+    def __post_init__(self) -> None:
         super().__init__("control")
         self.address = ""  # where it is bound, once open
-        self._on_event = on_event
-        self._handlers = handlers
-        self._on_idle = on_idle
         self._pending: list[_Pending] = []
         self._unread: list[_Unread] = []
         self._socket: zmq.Socket[bytes]

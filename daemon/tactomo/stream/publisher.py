@@ -12,6 +12,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, Final
 
 import zmq
@@ -37,6 +38,7 @@ NO_FRAME_YET: Final[dict[str, Any]] = {
 }
 
 
+@dataclass(eq=False)
 class Publisher(Worker):
     """Numbers, stamps and sends messages; publishes the status every second, or when asked to.
 
@@ -45,17 +47,16 @@ class Publisher(Worker):
     `open` it, `start` its thread, `stop` it.
     """
 
-    def __init__(
-        self,
-        sensor: str,  # the name in every topic
-        session: str,  # identity of this run of the daemon
-        # returns the current fields of a `status` message with that header; called by the thread
-        status: Callable[[Mapping[str, Any]], Mapping[str, Any]],
-        # called with kind and bytes of each frame's message, before it is sent: whatever was seen
-        # is in the recording
-        on_frame: Callable[[str, bytes], None],
-        on_event: OnEvent,  # told of a flood of subscriptions, and of messages that cannot be sent
-    ) -> None:
+    _sensor: str  # the name in every topic
+    _session: str  # identity of this run of the daemon
+    # returns the current fields of a `status` message with that header; called by the thread
+    _status: Callable[[Mapping[str, Any]], Mapping[str, Any]]
+    # called with kind and bytes of each frame's message, before it is sent: whatever was seen is in
+    # the recording
+    _on_frame: Callable[[str, bytes], None]
+    _on_event: OnEvent  # told of a flood of subscriptions, and of messages that cannot be sent
+
+    def __post_init__(self) -> None:
         super().__init__("publisher")
         self.address = ""  # where it is bound, once open
         self.subscribers = 0  # subscriptions in force
@@ -64,11 +65,6 @@ class Publisher(Worker):
         self.header: Mapping[str, Any] = NO_FRAME_YET
         # from the last byte of a dual scan until its contacts are handed over
         self.latency = Durations()
-        self._sensor = sensor
-        self._session = session
-        self._status = status
-        self._on_frame = on_frame
-        self._on_event = on_event
         self._sequence: Counter[str] = Counter()  # the last one of each kind, under _lock
         self._lock = threading.Lock()
         self._readers: Subscribers  # this thread's own, as are _socket and _cuts_*

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from tactomo_models import SensorDescription
@@ -33,13 +34,15 @@ class SimulatedCompanions:
         return [each.read(forces_n[name], time_s, counter) for name, each in self._each.items()]
 
 
+@dataclass(eq=False)
 class _SimulatedCompanion:
-    def __init__(self, index: int, companion: Companion, seed: int) -> None:
-        self._index = index
-        self._companion = companion
-        self._seed = seed
-        off = np.random.default_rng([seed, index, 8]).standard_normal()
-        self._gain = 1 + companion.relative_error * float(off)
+    _index: int
+    _companion: Companion
+    _seed: int
+
+    def __post_init__(self) -> None:
+        off = np.random.default_rng([self._seed, self._index, 8]).standard_normal()
+        self._gain = 1 + self._companion.relative_error * float(off)
         self._to_come: deque[tuple[float, float]] = deque()  # forces within the dead time
         self._through_n = 0.0  # the force that has come through the dead time
         self._seen_n, self._seen_s = 0.0, 0.0  # the force behind the lag, and when

@@ -10,6 +10,8 @@ same skin again.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from tactomo_models.arrays import FloatArray
@@ -18,18 +20,13 @@ from tactomo_protocol import Channel
 ADC_BITS = 24
 
 
+@dataclass
 class Converter:
     """Turns volts into counts. `noise_v` may be changed between scans."""
 
-    def __init__(
-        self,
-        full_scale_v: float,  # volts at the end of the converter's range, either sign
-        noise_v: float,  # standard deviation of the noise in volts, the same on every measurement
-        seed: int = 0,  # equal seeds give equal noise
-    ) -> None:
-        self.full_scale_v = full_scale_v
-        self.noise_v = noise_v
-        self._seed = seed
+    full_scale_v: float  # volts at the end of the converter's range, either sign
+    noise_v: float  # standard deviation of the noise in volts, the same on every measurement
+    seed: int = 0  # equal seeds give equal noise
 
     @property
     def volts_per_count(self) -> float:
@@ -40,7 +37,7 @@ class Converter:
         self, volts: FloatArray, *, channel: Channel, counter: int
     ) -> tuple[NDArray[np.int32], bool]:
         """Return the counts of one scan, (M,), and whether any of them hit the end of the range."""
-        noise = np.random.default_rng([self._seed, channel.number, counter, 1])
+        noise = np.random.default_rng([self.seed, channel.number, counter, 1])
         seen_v = volts + self.noise_v * noise.standard_normal(len(volts))
         top = 2 ** (ADC_BITS - 1) - 1
         counts = np.rint(seen_v / self.volts_per_count)

@@ -17,6 +17,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Final
@@ -41,19 +42,15 @@ STOP_S: Final = 8.0  # two seconds less than systemd gives the parent
 log = structlog.get_logger()
 
 
+@dataclass(eq=False)
 class _Process:
-    def __init__(self, name: str, run: Callable[[], int], ear: socket.socket) -> None:
-        self.name = name
-        self.run = run
-        self.ear = ear
-        self.pid = 0
-        self.status = "starting"
-        self.is_ready = False
-        self.has_been_ready = False
-        self.is_aborted = False
-        self.is_done = False
-        self.fed_s = 0.0
-        self.ended_s = 0.0
+    name: str
+    run: Callable[[], int]
+    ear: socket.socket
+    pid = 0
+    status = "starting"
+    is_ready = has_been_ready = is_aborted = is_done = False
+    fed_s = ended_s = 0.0
 
     def hear(self) -> None:
         """Take note of what the daemon has notified."""
