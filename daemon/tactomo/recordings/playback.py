@@ -9,36 +9,32 @@ from __future__ import annotations
 import math
 import threading
 import time
+from dataclasses import dataclass
 from typing import Any, Final
 
 MAX_LAG_S: Final = 0.25
 """How late bytes may be read before the replay waits for whoever reads them."""
 
 
+@dataclass(eq=False)
 class Playback:
     """Where a replay is, for any thread; speed 0 is as fast as it is taken."""
 
-    def __init__(
-        self,
-        start_ns: int,
-        end_ns: int,
-        speed: float,
-        last_ns: int | None = None,
-        is_exact: bool = False,
-    ) -> None:
-        self.passes = 0  # how often it was moved
-        self.maps_before = 0  # how many maps were published before this pass
-        self.start_ns = self.begin_ns = start_ns  # of the recording; of this pass
-        self.loops = False  # whether the end is followed by the beginning
-        self.waits_for_page = False  # whether it is paused until somebody looks
-        self.is_exact = is_exact  # whether it goes by what was recorded of each frame
+    start_ns: int  # of the recording
+    _end_ns: int  # likewise
+    _speed: float
+    _last_ns: int  # from where something still comes
+    is_exact: bool = False  # whether it goes by what was recorded of each frame
+    passes = 0  # how often it was moved
+    maps_before = 0  # how many maps were published before this pass
+    loops = False  # whether the end is followed by the beginning
+    waits_for_page = False  # whether it is paused until somebody looks
+    _is_paused = _is_stepping = False
+
+    def __post_init__(self) -> None:
+        self.begin_ns = self.start_ns  # of this pass
         self.steered_ns = time.monotonic_ns()  # when somebody last steered it
-        self._end_ns = end_ns
-        self._last_ns = end_ns if last_ns is None else last_ns  # from where something still comes
-        self._speed = speed
-        self._is_paused = False
-        self._is_stepping = False
-        self._position_ns = start_ns  # when it was last paused, moved or paced otherwise
+        self._position_ns = self.start_ns  # when it was last paused, moved or paced otherwise
         self._since_ns: int | None = None  # when that was, monotonic; None before anything is read
         self._changed = threading.Condition(threading.RLock())
 

@@ -126,7 +126,11 @@ def read_replay(urls: Sequence[str], description: SensorDescription) -> Replay |
         is_paced=speed > 0,
         protocol=recording.origin.protocol,
         playback=Playback(
-            recording.start_ns, recording.end_ns, speed, _last_ns(marks), bool(marks)
+            recording.start_ns,
+            recording.end_ns,
+            speed,
+            _last_ns(marks) or recording.end_ns,
+            is_exact=bool(marks),
         ),
         calibration=calibration,
         knows_calibration=calibration is not None or had_none,

@@ -10,16 +10,14 @@ import numpy as np
 from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray, IntArray
 
-from tactomo.twin.foreign import Emulator, Frame, Grounded
+from tactomo.twin.foreign import Emulator, Frame
 
 
 class MatrixBoard(Emulator):
     """A board that prints a table at its own pace, once it was told to; see `protocols.matrix`."""
 
     def __init__(self, description: SensorDescription, rate_hz: float) -> None:
-        self.rate_hz = rate_hz  # frames a second
-        self.is_streaming = False  # whether it sends frames
-        self._description = description
+        super().__init__(description, rate_hz)
         self._gain = 0.0
         self._heard = b""
         pairs = description.pairs
@@ -27,7 +25,6 @@ class MatrixBoard(Emulator):
             _numbered(description.drive_pairs, pairs.drive),
             _numbered(description.measure_pairs, pairs.measure),
         )
-        self._grounded = Grounded(description)
         self._start = description.instrument.start.encode()
         self._is_single_ended = description.instrument.referenced == "single_ended"
 

@@ -39,8 +39,12 @@ class Emulator:
     A protocol's class names a subclass as its `emulator`. For use by one thread.
     """
 
-    rate_hz: float  # frames a second; the host may have changed it
-    is_streaming: bool  # whether it sends frames at present
+    is_streaming = False  # whether it sends frames at present
+
+    def __init__(self, description: SensorDescription, rate_hz: float) -> None:
+        self.rate_hz = rate_hz  # frames a second; the host may have changed it
+        self._description = description
+        self._grounded = Grounded(description)
 
     def greeting(self) -> list[bytes]:
         """Return what it says when it is switched on, or plugged in."""

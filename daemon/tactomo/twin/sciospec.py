@@ -27,7 +27,7 @@ from tactomo.protocols.sciospec import (
     Ack,
     message,
 )
-from tactomo.twin.foreign import Emulator, Frame, Grounded
+from tactomo.twin.foreign import Emulator, Frame
 
 GROUPS: Final = 4
 RATE_HZ: Final = (0.1, 100.0)
@@ -39,10 +39,7 @@ class SciospecEmulator(Emulator):
     """See `Emulator`."""
 
     def __init__(self, description: SensorDescription, rate_hz: float) -> None:
-        self.rate_hz = rate_hz
-        self.is_streaming = False
-        self._description = description
-        self._grounded = Grounded(description)
+        super().__init__(description, rate_hz)
         self._drives = {tuple(pair): row for row, pair in enumerate(_drives(description))}
         self._buffer = b""
         self._heard_s = 0.0

@@ -87,7 +87,7 @@ def test_what_overflows_is_counted_as_received_and_dropped(monkeypatch: pytest.M
 def test_an_unpaced_replay_waits_for_the_slower_port() -> None:
     frames = Frames()
     frames.go.set()
-    replay = Replay([], None, is_paced=False, playback=Playback(0, 0, 0), protocol="tactomo")
+    replay = Replay([], None, is_paced=False, playback=Playback(0, 0, 0, 0), protocol="tactomo")
     pipeline = started(frames, replay=replay)
     for port, channel in enumerate(BOTH):  # one is seconds ahead of the other
         for counter in range(5):

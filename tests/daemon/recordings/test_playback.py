@@ -207,7 +207,7 @@ def test_the_first_frame_after_a_move_has_the_time_to_be_found_anew(play: Any, l
 def test_a_replay_does_not_run_ahead_of_who_reads_it(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s = 100.0
     monkeypatch.setattr("time.monotonic_ns", lambda: round(now_s * 1e9))
-    playback = Playback(0, 10 * 10**9, speed=2.0)
+    playback = Playback(0, 10 * 10**9, 2.0, 10 * 10**9)
     assert playback.wait_until_due(0, 0.0, 0)
     now_s += 0.5
     assert playback.wait_until_due(900_000_000, 0.0, 0)  # 50 ms late

@@ -6,11 +6,13 @@ interrupted goes on.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from tactomo_client import Keys
+from tactomo_client.keys import as_keys
 from tactomo_models.archive import read_arrays, write_arrays
 from tactomo_models.arrays import FloatArray
 from tactomo_models.calibration.calibration_file import Subject
@@ -46,29 +48,23 @@ def guided(
     """
     from tactomo.cli.console import Console
 
-    return _Session(
-        sensor, stream, keys, description, file, Console(highlight=False, soft_wrap=True)
-    ).run()
+    console = Console(highlight=False, soft_wrap=True)
+    return _Session(sensor, stream, as_keys(keys), description, file, console).run()
 
 
+@dataclass
 class _Session:
     """Asks, listens, and keeps."""
 
-    def __init__(
-        self,
-        sensor: str,
-        stream: str,
-        keys: Path | None,
-        description: str | None,
-        file: Path,
-        console: Console,
-    ) -> None:
-        self._sensor, self._stream, self._given = sensor, stream, description
-        self._keys = None if keys is None else Keys.load(keys)
-        self._file, self._console = file, console
-        self._arrays: dict[str, Any] = {}
-        if file.exists():
-            self._arrays = read_arrays(file)
+    _sensor: str
+    _stream: str
+    _keys: Keys | None
+    _given: str | None
+    _file: Path
+    _console: Console
+
+    def __post_init__(self) -> None:
+        self._arrays: dict[str, Any] = read_arrays(self._file) if self._file.exists() else {}
 
     def run(self) -> tuple[SensorDescription, Subject]:
         """Take presses until the user has enough; Ctrl-C ends it, too."""
