@@ -272,8 +272,9 @@ def scans_of(
                 references[name] = _at_rest(source, key, arrays[key], description.measurements)
     if not scans:
         raise DataError(
-            f"{source} holds none of the channels of {description.name!r} "
-            f"({', '.join(description.channels)}); it holds: {', '.join(arrays) or 'nothing'}"
+            f"{source} holds voltages of none of the channels of {description.name!r}: "
+            f"{' and '.join(description.channels)}, missing or NaN throughout; it holds: "
+            f"{', '.join(arrays) or 'nothing'}"
         )
     lengths = {name: len(channel) for name, channel in scans.items()}
     if len(set(lengths.values())) > 1:

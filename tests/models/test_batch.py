@@ -97,6 +97,7 @@ def test_bad_input_is_refused_with_what_is_needed(
 ) -> None:
     bad: list[tuple[Arrays, str]] = [
         ({}, "none of the channels"),
+        ({each: np.nan * volts for each, volts in arrays.items()}, "NaN throughout"),
         ({**arrays, "magnitude": np.zeros((3, 192))}, "T x 208"),
         ({**arrays, "magnitude": np.zeros((2, 208))}, "differ in length"),
         ({**arrays, "magnitude": np.array(["a"] * 208)}, "real numbers"),

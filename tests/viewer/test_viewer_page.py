@@ -261,11 +261,38 @@ def quiet_console(page: Page) -> Iterator[None]:
     assert ours == []
 
 
+RADIOS, CHECKS = ("unit", "scale"), ("smooth", "outline")
+
+
 # What it draws
 
 
 def is_bright(page: Page, x_mm: float, y_mm: float) -> bool:
     return sum(page.colour(x_mm, y_mm)) > 350
+
+
+def test_what_somebody_chose_to_see_is_there_when_the_page_is_opened_anew(page: Page) -> None:
+    def shown() -> list[Any]:
+        chosen = [
+            page.js(f"return document.querySelector('[name={n}]:checked').value") for n in RADIOS
+        ]
+        checked = [
+            page.js(f"return tactomo && document.getElementById('{n}').checked") for n in CHECKS
+        ]
+        return [*chosen, page["colormap"].get_attribute("value"), *checked]
+
+    page.skin.press(36, -48, kpa=200)
+    page.open()
+    assert shown() == ["kpa", "sensor", "inferno", True, True]
+    for selector in ("[name=unit][value=percent]", "[name=scale][value=fit]", "#smooth"):
+        page.js(f"document.querySelector('{selector}').click()")
+    page["colormap"].send_keys("v")
+    wait_until(lambda: shown() == ["percent", "fit", "viridis", False, True])
+    page.open()
+    assert shown() == ["percent", "fit", "viridis", False, True]
+    page.js("localStorage.setItem('scale', 'none'); localStorage.setItem('colormap', 'none')")
+    page.open()
+    assert shown() == ["percent", "sensor", "inferno", False, True]
 
 
 @pytest.mark.usefixtures("quiet_console")

@@ -232,5 +232,5 @@ function clock(realtimeNs) {
 function bytes(count) {
   if (!(count >= 1000)) return `${count ?? 0} B`;
   const power = Math.min(3, Math.floor(Math.log10(count) / 3));
-  return `${fixed(count / 1000 ** power, 1)} ${["B", "kB", "MB", "GB"][power]}`;
+  return `${fixed(count / 1000 ** power, 1)}\u00a0${["B", "kB", "MB", "GB"][power]}`;
 }

@@ -475,7 +475,26 @@ byId("clear").onclick = () => touch.clear();
 byId("hold").onchange = ({ target }) => { touch.hold = target.checked; };
 for (const id of ["pressure", "size", "shape"]) byId(id).oninput = showIndenter;
 for (const input of document.querySelectorAll("#view input, #view select, input[name=unit]")) {
-  input.addEventListener("change", () => { redraw(); refresh(); });
+  const [key, isCheck] = [input.name || input.id, input.type === "checkbox"];
+  const before = kept(key);
+  if (input.type === "radio") input.checked ||= before === input.value;
+  else if (isCheck && before !== null) input.checked = before === "true";
+  else if ([...input.options ?? []].some(({ value }) => value === before)) input.value = before;
+  input.addEventListener("change", () => {
+    kept(key, isCheck ? input.checked : input.value);
+    redraw();
+    refresh();
+  });
+}
+
+// What somebody chose to see, for when the page is opened anew; null where a browser keeps nothing.
+function kept(key, value) {
+  try {
+    if (value !== undefined) localStorage.setItem(key, value);
+    return localStorage.getItem(key);
+  } catch {
+    return null;
+  }
 }
 
 let pointer = null;  // where it is, in mm: what comes under it while it rests is read out, too
