@@ -1003,7 +1003,8 @@ def test_a_replay_is_steered_by_the_page(page: Page) -> None:
     wait_until(lambda: page["position-text"].text.endswith("/ 40.0 s"))
     assert page["speed"].get_attribute("value") == "1"
     wait_until(lambda: page.js("return tactomo.timeline.frames.length") > 5)
-    page["play"].click()
+    page.browser.find_element(By.TAG_NAME, "body").send_keys(" ")
+    wait_until(lambda: page.daemon.requests[:1] == [("replay", {"paused": True})])
     page.skin.status |= {"state": "paused", "replay": REPLAY | {"paused": True}}
     page.skin.sends_frames = False
     wait_until(lambda: page.health == "replay-paused")

@@ -15,6 +15,11 @@ export class Replay {
     this.stood = [];  // {at, position_s}: where it was in the last while
     byId("play").onclick = () => this.#ask(
       this.#hasEnded ? { position_s: 0, paused: false } : { paused: !this.fields.paused });
+    addEventListener("keydown", (event) => {
+      if (event.key !== " " || event.target !== document.body || byId("replay").hidden) return;
+      event.preventDefault();  // the page would scroll
+      byId("play").click();
+    });
     byId("step").onclick = () => this.#ask({ step: true });
     byId("position").oninput = ({ target }) => this.#move(Number(target.value));
     byId("speed").onchange = ({ target }) => this.#ask({ speed: Number(target.value) });
