@@ -52,14 +52,7 @@ class SampleFormat(IntEnum):
     @property
     def dtype(self) -> np.dtype[Any]:
         """The NumPy type, in this machine's byte order, that holds these samples exactly."""
-        return _DTYPES[self]
-
-
-_DTYPES: dict[SampleFormat, np.dtype[Any]] = {
-    SampleFormat.INT16: np.dtype(np.int16),
-    SampleFormat.INT32: np.dtype(np.int32),
-    SampleFormat.FLOAT32: np.dtype(np.float32),
-}
+        return np.dtype(self.name.lower())
 
 
 class ScanFlag(IntFlag):

@@ -50,6 +50,8 @@ class ChannelBaseline:
         # whether what is in force is behind what is known by more than is worth a change
         self.has_moved = False
         self._amounts = np.zeros(subspace.modes.shape[1])
+        self._most = np.full_like(self._amounts, np.inf)  # that skins reach since the tare
+        self._most[0], self._most[subspace.smooth] = MAX_GAIN, MAX_SMOOTH
         self._residual = np.zeros(len(tare))
         self._jumped = np.zeros(len(tare))  # beside creep, since something was let go that creeps
         self._precision = self._noise_variance = np.zeros(len(tare))
@@ -94,7 +96,7 @@ class ChannelBaseline:
         found = self._explain(change + self._residual, self._precision, sigma)
         bounds = OUT_OF_BOUNDS * sigma
         wanted = self._kept() + np.clip(found.amounts, -bounds, bounds)
-        missing = self._limited(wanted) - self._amounts
+        missing = np.clip(wanted, -self._most, self._most) - self._amounts
         self._amounts = self._amounts + share * missing
         self._amounts[0] += ahead * missing[0]
         drift = self._subspace.modes @ self._amounts
@@ -229,15 +231,7 @@ class ChannelBaseline:
 
     def _excess(self, amounts: FloatArray) -> float:
         """How far beyond all that skins reach amounts (K,) since the tare are; good below 1."""
-        smooth = float(np.abs(amounts[self._subspace.smooth]).max(initial=0.0))
-        return max(abs(float(amounts[0])) / MAX_GAIN, smooth / MAX_SMOOTH)
-
-    def _limited(self, amounts: FloatArray) -> FloatArray:
-        limited = amounts.copy()
-        limited[0] = np.clip(limited[0], -MAX_GAIN, MAX_GAIN)
-        smooth = self._subspace.smooth
-        limited[smooth] = np.clip(limited[smooth], -MAX_SMOOTH, MAX_SMOOTH)
-        return limited
+        return float((np.abs(amounts) / self._most).max())
 
     def _know(self, baseline: FloatArray) -> None:
         min_move = 0.05  # rms, in standard deviations of one scan, that is worth a new one
