@@ -38,14 +38,6 @@ def lookup_of(skin: SensorDescription) -> IntArray:
     return np.hstack([skin.pairs.drive, skin.pairs.measure])
 
 
-def test_opposite_drive_comes_from_the_description(skin: SensorDescription) -> None:
-    assert skin.measurements == 192
-    drive, measure = skin.pairs.drive, skin.pairs.measure
-    np.testing.assert_array_equal((drive[:, 0] + 8) % 16, drive[:, 1])
-    np.testing.assert_array_equal((measure[:, 0] + 1) % 16, measure[:, 1])
-    assert all(len({*d, *m}) == 4 for d, m in zip(drive.tolist(), measure.tolist(), strict=True))
-
-
 @given(seed=st.integers(0, 2**32 - 1))
 def test_any_order_and_sign_is_brought_back(skin: SensorDescription, seed: int) -> None:
     rng = np.random.default_rng(seed)
