@@ -28,7 +28,9 @@ from tactomo_models.scene.pressure import PressureCurve
 from tactomo_models.sensor.description import SensorDescription
 
 SUFFIX: Final = ".pressure.json"
-Points = Annotated[tuple[float, ...], Field(min_length=2, max_length=256)]
+Kpa = Annotated[float, Field(ge=-MAX_KPA, le=MAX_KPA)]  # as any skin's
+Points = Field(min_length=2, max_length=256)
+PointsKpa = Annotated[tuple[Annotated[Kpa, Field(ge=0)], ...], Points]
 
 
 class Subject(BaseModel, extra="forbid", frozen=True):
@@ -101,13 +103,13 @@ class PressureCalibration(BaseModel, extra="forbid", frozen=True, allow_inf_nan=
     taken: str  # when, ISO 8601, UTC
     readings: tuple[Reading, ...]  # what it was fitted to
     # magnitude, pressure_kpa, sigma_kpa: its curve, see `PressureCurve`
-    magnitude: Points
-    pressure_kpa: Points
-    sigma_kpa: Points
+    magnitude: Annotated[tuple[Annotated[float, Field(ge=0, le=2 * MAX_MAGNITUDE)], ...], Points]
+    pressure_kpa: PointsKpa
+    sigma_kpa: PointsKpa
     # onset_kpa, hysteresis_kpa, repeatability_kpa: see `Fit`; None where unknown
-    onset_kpa: float | None
-    hysteresis_kpa: float | None
-    repeatability_kpa: float
+    onset_kpa: Kpa | None
+    hysteresis_kpa: Kpa | None
+    repeatability_kpa: Kpa
 
     @model_validator(mode="after")
     def _is_a_curve(self) -> Self:
@@ -116,17 +118,6 @@ class PressureCalibration(BaseModel, extra="forbid", frozen=True, allow_inf_nan=
             raise ValueError("magnitude, pressure_kpa and sigma_kpa differ in length")
         if np.any(np.diff(self.magnitude) <= 0) or np.any(np.diff(self.pressure_kpa) < 0):
             raise ValueError("magnitude and pressure_kpa must rise")
-        for name, most in (
-            ("magnitude", 2 * MAX_MAGNITUDE),
-            ("pressure_kpa", MAX_KPA),
-            ("sigma_kpa", MAX_KPA),
-        ):
-            values = getattr(self, name)
-            if not 0 <= min(values) <= max(values) <= most:
-                raise ValueError(f"{name} must be between 0 and {most:g}, as any skin's are")
-        for name in ("onset_kpa", "hysteresis_kpa", "repeatability_kpa"):
-            if abs(getattr(self, name) or 0.0) > MAX_KPA:
-                raise ValueError(f"{name} must be at most {MAX_KPA:g}, as any skin's is")
         return self
 
     @classmethod
