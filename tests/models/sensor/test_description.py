@@ -93,7 +93,7 @@ def structure_table(ratios: str) -> str:
         ),
         (
             ("conductivity_ratio = 100.0", structure_table("[1.0, 0.5, -0.1]")),
-            ["structure.response", "conductivity_ratio", "above 0"],
+            ["structure.response.conductivity_ratio.2 = -0.1: give a number greater than 0"],
         ),
         (("conductivity_ratio = 100.0", "conductivity_ratio = 1.0"), ["differ from 1"]),
         (
