@@ -113,8 +113,9 @@ def test_a_played_stream_gives_what_its_import_gives(start: Start, tmp_path: Pat
     live, imported = tmp_path / "live.mcap", "import.mcap"
     tank = changed(tmp_path, TANK)
     settings = {"lossless": True, "recording": {"file": str(live), "maps": True}}
-    [volts] = read_scans(path, load_description(tank), None).volts.values()
-    skin = MeasuredSkin(volts)
+    description = load_description(tank)
+    [volts] = read_scans(path, description, None).volts.values()
+    skin = MeasuredSkin(description, volts)
     _, daemon = start(tank, settings, skin, noise_v=0.0)
     wait_until(lambda: skin.said > len(volts) + 5, "its scans", 60.0)
     wait_until(lambda: daemon.status()["frames"] > len(volts), "its frames", 300.0)

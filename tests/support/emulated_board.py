@@ -10,7 +10,7 @@ from typing import Any
 from daemon_process import ANYWHERE, SENSOR, DaemonProcess
 from tactomo.twin import Twin, TwinConfig
 from tactomo_client import Frame, subscribe
-from tactomo_models import Press, load_description
+from tactomo_models import Press, SensorDescription, SkinSimulator, load_description
 from tactomo_models.arrays import FloatArray
 from tactomo_protocol import Channel
 from variants import rewritten
@@ -53,10 +53,11 @@ def frame_where(daemon: DaemonProcess, condition: Callable[[Frame], bool]) -> Fr
         return next(frame for frame in frames if condition(frame))
 
 
-class MeasuredSkin:
+class MeasuredSkin(SkinSimulator):
     """Says scans (T, M), volts, one after another, again and again, whatever presses."""
 
-    def __init__(self, scans: FloatArray) -> None:
+    def __init__(self, description: SensorDescription, scans: FloatArray) -> None:
+        self.description = description
         self._scans = scans
         self.said = 0
 

@@ -9,23 +9,25 @@ from typing import Any, Self
 import numpy as np
 import pytest
 import serial
-from tactomo.twin import SkinModel, Twin, TwinConfig
+from tactomo.twin import Twin, TwinConfig
 from tactomo_client import request
-from tactomo_models import Press, load_description
+from tactomo_models import Press, SkinSimulator, load_description
 from tactomo_models.arrays import FloatArray
 from tactomo_protocol import Channel, Command, CommandCode, Decoder, Packet, Scan, encode
 from waiting import PATIENCE_S, wait_until
 
 MEASUREMENTS = 208
+PAPER = load_description("paper_square")
 
 
-class FlatSkin:
+class FlatSkin(SkinSimulator):
     """Every voltage of a channel is the same and tells the sum of the pressures.
 
     0.1 V unloaded; 1 mV more a kPa on the magnitude channel, 2 mV on the structure channel.
     """
 
-    def __init__(self, seconds: float = 0.0) -> None:
+    def __init__(self, seconds: float = 0.0) -> None:  # without a mesh
+        self.description = PAPER
         self.seconds = seconds
 
     def voltages(self, presses: Sequence[Press]) -> dict[Channel, FloatArray]:
@@ -93,7 +95,7 @@ def bench() -> Iterator[Callable[..., Bench]]:
     running: list[Bench] = []
 
     def start(
-        skin: SkinModel | None = None,
+        skin: SkinSimulator | None = None,
         solve_s: float = 0.0,
         sensor: str = "paper_square",
         **config: Any,

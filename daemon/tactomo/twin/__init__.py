@@ -13,14 +13,13 @@ every scan.
     twin.stop()
 """
 
-from tactomo.twin.device import SkinModel, Twin, TwinConfig, make_skin
+from tactomo.twin.device import Twin, TwinConfig, make_skin
 from tactomo.twin.scene import Indenter, Scene, ScriptedPress, Waypoint, load_scene
 
 __all__ = [
     "Indenter",
     "Scene",
     "ScriptedPress",
-    "SkinModel",
     "Twin",
     "TwinConfig",
     "Waypoint",

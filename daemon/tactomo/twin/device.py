@@ -17,7 +17,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import zmq
@@ -67,13 +67,6 @@ NOISE_SHARE = 2.5e-4
 UNEVENNESS = 0.03
 # Contact impedances of pressed-on electrodes differ; the daemon's model must live with that.
 IMPEDANCE_SPREAD = 0.1
-
-
-class SkinModel(Protocol):
-    """What the twin needs of a forward model; `tactomo_models.SkinSimulator` is one."""
-
-    def voltages(self, presses: Sequence[Press], /) -> Voltages:
-        """Return the noise-free volts, (M,), of each channel of the sensor under these presses."""
 
 
 def make_skin(
@@ -155,7 +148,7 @@ class Twin:
     TactomoError where the control socket or the links cannot be had.
     """
 
-    def __init__(self, config: TwinConfig, skin: SkinModel | None = None) -> None:
+    def __init__(self, config: TwinConfig, skin: SkinSimulator | None = None) -> None:
         self.config = config
         self._script = config.scene
         self._started_s: float | None = None  # when the script was started, by the device's clock
@@ -169,11 +162,7 @@ class Twin:
                 ports.append(Port(SerialLine(line, config.link_folder), channels))
                 undo.callback(ports[-1].line.close)
             self._skin = skin or make_skin(config.description, config.unevenness, config.seed)
-            self._drifting = (
-                DriftingSkin(self._skin, config.skin_drift, config.seed)
-                if isinstance(self._skin, SkinSimulator)
-                else None
-            )
+            self._drifting = DriftingSkin(self._skin, config.skin_drift, config.seed)
             undo.pop_all()
         self._companions = SimulatedCompanions(config.description, config.seed)
         self._converter = self._make_converter()
@@ -258,11 +247,7 @@ class Twin:
         if self._started_s is None and any(p.line.is_open for p in self._firmware.ports):
             self._play_at(time_s)
         presses = self._presses_at(time_s)
-        future: Future[Voltages]
-        if self._drifting is None:
-            future = self._solver.submit(self._skin.voltages, presses)
-        else:
-            future = self._solver.submit(self._drifting.voltages, presses, time_s)
+        future: Future[Voltages] = self._solver.submit(self._drifting.voltages, presses, time_s)
         future.add_done_callback(lambda _: self._bell.ring())
         return future
 
@@ -276,8 +261,7 @@ class Twin:
         return self._script.presses_at(max(0.0, time_s - self._started_s)) | self._live
 
     def _read_companions(self, time_s: float, counter: int) -> list[CompanionReading]:
-        """Return what companions read; only a simulated skin knows the force on it."""
-        if not isinstance(self._skin, SkinSimulator) or not self._skin.description.companion:
+        if not self.config.description.companion:
             return []
         forces_n = self._skin.forces_n(self._presses_at(time_s))
         return self._companions.read(forces_n, time_s, counter)
@@ -285,7 +269,7 @@ class Twin:
     def _play_at(self, time_s: float) -> None:
         """Start the scripted scene; it may say how the skin drifts."""
         self._started_s, script = time_s, self._script
-        if script is not None and script.drift is not None and self._drifting is not None:
+        if script is not None and script.drift is not None:
             self._drifting.drift = script.drift.skin_drift()
 
     def _make_firmware(self, ports: list[Port]) -> Firmware:
@@ -380,11 +364,6 @@ class Twin:
         return {}
 
     def _drift(self, arguments: SkinDriftSettings) -> dict[str, Any]:
-        if self._drifting is None:
-            raise CommandError(
-                "this twin's skin is not simulated: it does not drift",
-                "start a twin of a simulated skin",
-            )
         self._drifting.drift = arguments.skin_drift(self._drifting.drift)
         return {}
 
