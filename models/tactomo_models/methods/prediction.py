@@ -166,7 +166,7 @@ def start_of(
     graded = next((r for r in fit.responses.values() if isinstance(r, GradedResponse)), None)
     if graded is None or not len(contacts):
         return contacts
-    peaks = np.linspace(field.onset, field.peak_limits[1], PEAKS)
+    peaks = np.linspace(field.onset, field.limits[1, PEAK], PEAKS)
     changes = _mean_changes(graded, contacts[0], field.unit_kpa * peaks)
     asked = _mean_changes(graded, contact, field.unit_kpa * contact[PEAK, None])
     contacts[:, PEAK] = np.interp(asked, changes, peaks)

@@ -375,7 +375,7 @@ class Search:
             lifted = self._lifted(self._lightened(account, frame), frame)
             tried = replace(belief, account=lifted, lifts_none=lifted is account)
             return self._asking_again(tried, due=False)
-        specks = account.contacts[:, SIZE] <= self.field.size_limits[0]
+        specks = account.contacts[:, SIZE] <= self.field.limits[0, SIZE]
         if specks.any():
             return self._without_specks(belief, specks, frame)
         if not belief.is_parted and _is_light(account):
@@ -588,13 +588,15 @@ class Search:
         """The belief with contacts that touch as one, where that is likelier."""
         account = belief.account
         for touching in _touching(account.contacts, self.field.half_width_m):
+            now = at_end(self.fit, account, frame).log_evidence
             rest = np.delete(account.contacts, touching, axis=0)
             one = as_one(account.contacts[touching])
             for kind in (Kind.EVEN, Kind.FALLING, Kind.ROUNDED):
                 each = np.vstack([rest, as_kind(one, kind)])
                 start = self._account(each, account.fitted.log_ratio, frame)
-                joined = self._descended(start, frame, self._steps(account, frame))
-                if joined.log_evidence > account.log_evidence:
+                found = self._checked(start, np.array([len(rest)]), now, frame, FAR_STEPS)
+                if found.log_evidence > now:
+                    joined = self._account(found.every, found.log_ratio, frame)
                     return self._begun(joined, frame, belief.how)
         return replace(belief, is_parted=True)
 
@@ -620,7 +622,7 @@ class Search:
             steps = STEPS if holds else self._steps(account, frame)
             grown = self._descended(start, frame, steps, holds_ratio=holds)
             # As small as it may be, it is an error of the model, not a contact.
-            is_speck = grown.contacts[-1, SIZE] <= self.field.size_limits[0]
+            is_speck = grown.contacts[-1, SIZE] <= self.field.limits[0, SIZE]
             if grown.log_evidence > account.log_evidence and not is_speck:
                 return replace(grown, at_minimum=grown.at_minimum and not holds)
         return account
@@ -642,7 +644,7 @@ class Search:
     def _start_peak(self, frame: Frame) -> float:
         """Peak that a contact starts with: below the onset where the graded sheet rests."""
         if frame.fits_peaks and frame.measured[Channel.MAGNITUDE].quiet:
-            return max(self.field.onset / 2, self.field.peak_limits[0])
+            return max(self.field.onset / 2, float(self.field.limits[0, PEAK]))
         return self.field.typical_peak
 
     @staticmethod
@@ -679,7 +681,10 @@ def _pressed_peaks(account: Account) -> FloatArray:
 
 def _touching(contacts: FloatArray, near_m: float) -> Iterator[list[int]]:
     """Groups of contacts whose outlines are so near to each other, the largest group first."""
-    count, group = connected_components(_gaps_between(contacts) < near_m)
+    near = _gaps_between(contacts) < near_m
+    if np.count_nonzero(near) == len(contacts):
+        return  # each is near to itself alone
+    count, group = connected_components(near)
     groups = [np.flatnonzero(group == number).tolist() for number in range(count)]
     yield from sorted((one for one in groups if len(one) > 1), key=len, reverse=True)
 

@@ -381,7 +381,7 @@ class FieldAccountant:
             peaks = family.unit_kpa * each[owner, PEAK]
             index = family.index[owner, PEAK]
             by_peak = family.unit_kpa * np.eye(by_share.shape[1])[index]
-            rests = peaks <= max(self._graded.onset_kpa, family.unit_kpa * family.peak_limits[0])
+            rests = peaks <= max(self._graded.onset_kpa, family.unit_kpa * family.limits[0, PEAK])
             less = self._goes_wrong_way(J[:, index], fitted.residual, rests)
             known["goes_wrong_way"] = known["goes_wrong_way"] or less
         peak_size, peak_slope = self._felt(peaks)

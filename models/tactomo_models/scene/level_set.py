@@ -80,7 +80,7 @@ class LevelSet:
         if self._field is None:
             return parameters
         mu, peaks = np.split(parameters, [self.kernels.shape[1]])
-        return np.append(mu, np.clip(peaks, *self._field.peak_limits))
+        return np.append(mu, np.clip(peaks, *self._field.limits[:, PEAK]))
 
     def draw(self, parameters: FloatArray) -> Drawing:
         """Draw what is pressed on the nodes."""

@@ -77,11 +77,10 @@ class PressureField:
     grown_m2: float
     blur_m2: float  # variance of each axis by which the mesh blurs what is drawn; see above
     unit_kpa: float  # pressure that peaks are counted in: the end of the table
-    peak_limits: tuple[float, float]  # least and largest peak, in that unit
     onset: float  # pressure from which the graded sheet answers, in that unit
     # peak that a contact starts with, in that unit: the middle of what the table answers to
     typical_peak: float
-    size_limits: tuple[float, float]  # least and largest logarithm of the mean radius in metres
+    limits: FloatArray = field(repr=False)  # (2, COLUMNS) least and largest that a contact may have
     fills_box: bool = True  # whether the nodes lie all over their bounding box
     # (K, COLUMNS) parameters of each contact, as far as they are not fitted
     fixed: FloatArray = field(default_factory=lambda: np.zeros((0, COLUMNS)))
@@ -121,7 +120,14 @@ class PressureField:
         areas_m2 = np.sort(forward.triangle_areas_m2)
         node_m2 = 2 * float(areas_m2[areas_m2.cumsum().searchsorted(areas_m2.sum() / 2)])
         blur_m2 = of_triangles * node_m2 + of_step * (GRADED_WIDTH * spacing) ** 2
-        largest = float(np.log(np.hypot(description.width_m, description.height_m) / 2))
+        limits = np.array([[-np.inf], [np.inf]]) * np.ones(COLUMNS)
+        limits[:, X] = x.min() / UNIT_M, x.max() / UNIT_M
+        limits[:, Y] = y.min() / UNIT_M, y.max() / UNIT_M
+        longest_m = np.hypot(description.width_m, description.height_m) / 2
+        limits[:, SIZE] = SMALLEST_SIZE, np.log(longest_m)
+        limits[:, HARMONIC:PEAK] = [[-MAX_BULGE], [MAX_BULGE]]
+        limits[:, PEAK] = least, beyond
+        limits[:, EDGE] = EDGE_LIMITS  # where it is fitted: what is even is another kind
         return cls(
             x,
             y,
@@ -129,10 +135,9 @@ class PressureField:
             grown_m2=grown * reflected**1.5 * spacing**2,
             blur_m2=blur_m2,
             unit_kpa=end_kpa,
-            peak_limits=(least, beyond),
             onset=onset,
             typical_peak=(onset + 1) / 2,
-            size_limits=(SMALLEST_SIZE, largest),
+            limits=limits,
             fills_box=description.sheet.shape == "rectangle",
         )
 
@@ -203,31 +208,19 @@ class PressureField:
         """Inverse variances (N,) of that."""
         return self.join(np.broadcast_to(PRIOR_SIGMA**-2.0, self.free.shape))
 
-    @cached_property
-    def _sheet_limits(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Least and largest x and y of the nodes, as parameters count them."""
-        x, y = self.x_m / UNIT_M, self.y_m / UNIT_M
-        return (float(x.min()), float(x.max())), (float(y.min()), float(y.max()))
-
     def bounded(self, parameters: FloatArray) -> FloatArray:
         """Keep centres on the sheet, and sizes, forms and pressures to those of contacts."""
         max_elongated = 0.9  # half the logarithm of the ratio of an ellipse's axes
-        each = self.split(parameters)
-        for column, limits in zip((X, Y), self._sheet_limits, strict=True):
-            _limit(each[:, column], *limits)
+        least, most = self.limits
+        each = np.minimum(np.maximum(self.split(parameters), least), most)
         if not self.fills_box:
             for contact in each:
                 off = (self.x_m - UNIT_M * contact[X]) ** 2 + (self.y_m - UNIT_M * contact[Y]) ** 2
                 nearest = off.argmin()
                 if off[nearest] > self.half_width_m**2:  # on the sheet, a node is nearer
                     contact[[X, Y]] = self.x_m[nearest] / UNIT_M, self.y_m[nearest] / UNIT_M
-        _limit(each[:, SIZE], *self.size_limits)
         elongation = np.maximum(np.hypot(each[:, E1], each[:, E2]), 1e-12)
         each[:, E1:HARMONIC] *= np.minimum(1, max_elongated / elongation)[:, None]
-        _limit(each[:, HARMONIC:PEAK], -MAX_BULGE, MAX_BULGE)
-        _limit(each[:, PEAK], *self.peak_limits)
-        falls = self.fixed[:, EDGE] > 0  # and stays so: what is even is another kind
-        each[falls, EDGE] = np.clip(each[falls, EDGE], *EDGE_LIMITS)
         return self.join(each)
 
     def as_light(self, parameters: FloatArray, light: BoolArray) -> FloatArray:
@@ -286,12 +279,6 @@ class PressureField:
 def _rows(array: FloatArray) -> list[int]:
     """Where each row (of one or more dimensions) of an array that outlives its use begins."""
     return [address(array) + array.strides[0] * row for row in range(len(array))]
-
-
-def _limit(values: FloatArray, least: float, most: float) -> None:
-    """Bring values to limits in place: for a few values twice as fast as `np.clip`."""
-    np.maximum(values, least, out=values)
-    np.minimum(values, most, out=values)
 
 
 def ellipses_of(

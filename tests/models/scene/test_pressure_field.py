@@ -238,10 +238,10 @@ def test_contacts_stay_on_the_sheet_and_of_a_contacts_size(
     inside = family.split(bounded)
     assert np.abs(inside[:, X] * 0.01).max() <= np.abs(field.x_m).max() + 1e-12
     assert np.abs(inside[:, Y] * 0.01).max() <= np.abs(field.y_m).max() + 1e-12
-    least_size, most_size = field.size_limits
+    least_size, most_size = field.limits[:, SIZE]
     assert (inside[:, SIZE] >= least_size).all()
     assert (inside[:, SIZE] <= most_size).all()
-    least, most = field.peak_limits
+    least, most = field.limits[:, PEAK]
     assert (inside[:, PEAK] >= least).all()
     assert (inside[:, PEAK] <= most).all()
     np.testing.assert_allclose(family.bounded(bounded), bounded)
