@@ -24,7 +24,7 @@ from tactomo_lab.training.train import (
     save_checkpoint,
     train,
 )
-from tactomo_lab.training.training_scenes import simulate
+from tactomo_lab.training.training_scenes import FORMAT, simulate
 from tactomo_models import (
     ModelError,
     SensorDescription,
@@ -250,7 +250,7 @@ class TestCommand:
         result = tactomo("models", "train", tmp_path, "--description", square_file, status=1)
         assert "holds no simulated scenes; make some: tactomo models simulate" in result.stderr
         result = tactomo("models", "train", robust)
-        assert "holds scenes of format 3, sensor" in result.stderr
+        assert f"holds scenes of format {FORMAT}, sensor" in result.stderr
 
     def test_a_gpu_that_is_not_there_is_told(self, tactomo: Run, robust: Path) -> None:
         if torch.cuda.is_available():
