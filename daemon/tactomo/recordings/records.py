@@ -5,7 +5,7 @@ Apart from `recording`, which reads files without: who asks what is in one need 
 
 from __future__ import annotations
 
-from typing import Annotated, Final, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
 import structlog
 from pydantic import BaseModel, Field, Strict, StrictBool, StrictInt, StrictStr
@@ -28,7 +28,8 @@ _Record = TypeVar("_Record", bound=BaseModel)
 
 def read_reference(data: bytes) -> Reference:
     """Read a message of the topic ``reference``; raise RecordingError where it is none."""
-    record, fields = _read(_Reference, data), record_fields(data)
+    fields = record_fields(data)
+    record = _checked(_Reference, fields)
     if not fields.keys() >= set(REFERENCE_ARRAYS):
         raise malformed()
     try:
@@ -59,7 +60,7 @@ class KeptCalibration(BaseModel):
 
 def read_calibration(data: bytes) -> KeptCalibration:
     """Read a message of the topic ``calibration``; raise RecordingError where it is none."""
-    return _read(KeptCalibration, data)
+    return _checked(KeptCalibration, record_fields(data))
 
 
 def calibration_text(calibration: PressureCalibration | None) -> str:
@@ -86,7 +87,7 @@ def recorded_calibration(
 
 def read_mark(data: bytes) -> Mark:
     """Read a message of the topic ``frame``; raise RecordingError where it is none."""
-    mark = _read(_Mark, data)
+    mark = _checked(_Mark, record_fields(data))
     try:
         keys = [ScanKey(Channel.of_number(c), counter, device) for c, counter, device in mark.scans]
     except ValueError as error:
@@ -114,8 +115,8 @@ class _Mark(BaseModel):
     timing: tuple[StrictInt, StrictBool, StrictInt | None, StrictBool] | None = None
 
 
-def _read(kind: type[_Record], data: bytes) -> _Record:
+def _checked(kind: type[_Record], fields: dict[str, Any]) -> _Record:
     try:
-        return kind.model_validate(record_fields(data))
+        return kind.model_validate(fields)
     except ValueError as error:
         raise malformed() from error

@@ -595,8 +595,11 @@ class Search:
                 each = np.vstack([rest, as_kind(one, kind)])
                 start = self._account(each, account.fitted.log_ratio, frame)
                 found = self._checked(start, np.array([len(rest)]), now, frame, FAR_STEPS)
-                if found.log_evidence > now:
-                    joined = self._account(found.every, found.log_ratio, frame)
+                if found.log_evidence <= now:
+                    continue
+                end = self._account(found.every, found.log_ratio, frame)
+                joined = self._descended(end, frame, STEPS)
+                if joined.log_evidence > account.log_evidence:
                     return self._begun(joined, frame, belief.how)
         return replace(belief, is_parted=True)
 
