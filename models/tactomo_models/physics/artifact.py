@@ -29,7 +29,7 @@ from tactomo_models.sensor.description import SensorDescription
 
 Progress = Callable[[str], None]
 
-FORMAT = 6  # of the file; rises when what is in it changes
+FORMAT = 7  # of the file; rises when what is in it changes
 NOMINAL_SNR_DB = 60.0  # of the voltages' root mean square; until a tare has seen the real noise
 MODEL_ERROR = 0.003  # relative error of any voltage that no noise accounts for
 GREEN_DTYPE = np.float32  # seven digits of what is known to three

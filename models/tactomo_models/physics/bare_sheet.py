@@ -238,7 +238,8 @@ def assemble_sheet(
         rows += [corners.ravel(), potential]
         columns += [potential, corners.ravel()]
         values += [-weight.sum(axis=2).ravel()] * 2
-        lengths[index] = 2 * np.pi * radius_m
+        # Of the mesh as it is, moved or stretched: else current would leave the sheet elsewhere.
+        lengths[index] = weight.sum() * contact_m[index]
     potentials = nodes + np.arange(electrodes)
     rows.append(potentials)
     columns.append(potentials)

@@ -49,7 +49,8 @@ def rim_signs(pairs: Pairs, rim_order: IntArray) -> IntArray:
     """
     ends = rim_order[np.hstack([pairs.drive, pairs.measure])]
     source, *others = ends.T
-    sink, plus, minus = ((end - source) % (rim_order.max() + 1) for end in others)
+    on_rim = max(np.count_nonzero(rim_order >= 0), 1)
+    sink, plus, minus = ((end - source) % on_rim for end in others)
     one_way = (plus <= sink) & (minus <= sink)
     other_way = (plus >= sink) & (minus >= sink)
     signs = np.sign(minus - plus) * (one_way.astype(int) - other_way)

@@ -26,6 +26,7 @@ from tactomo_models.health.findings import Level
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scans.plausibility import Wiring
 from tactomo_models.scans.polarity import Polarity
+from tactomo_models.sensor.pattern import rim_signs, scan_pairs
 from tactomo_protocol import Channel
 from variants import variant
 
@@ -195,3 +196,8 @@ def test_no_press_turns_a_voltage_whose_pairs_do_not_cross(name: str) -> None:
         press = Press(x_m=x_m, y_m=y_m, pressure_kpa=100.0, radius_m=rng.uniform(0.004, 0.015))
         volts = skin.voltages([press])[Channel.STRUCTURE]
         np.testing.assert_array_equal(np.sign(volts), np.sign(predicted))
+
+
+def test_voltages_between_pads_alone_have_no_signs() -> None:
+    with np.errstate(all="raise"):
+        assert not rim_signs(scan_pairs(8), np.full(8, -1)).any()
