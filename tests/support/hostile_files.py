@@ -150,6 +150,16 @@ def tall_csv(path: Path) -> None:
     path.write_text("1\n" * MEGABYTE)
 
 
+def zeros_csv(path: Path) -> None:
+    """Scans of eight electrodes that measured nothing."""
+    path.write_text((",".join(["0"] * 40) + "\n") * 3)
+
+
+def beyond_csv(path: Path) -> None:
+    """Scans of eight electrodes, whose sums are beyond numbers."""
+    path.write_text((",".join(["1e308", "-1e308"] * 20) + "\n") * 3)
+
+
 def headless_csv(path: Path) -> None:
     """Nothing but header."""
     path.write_text("what is no number\n" * 100_000)
@@ -350,6 +360,8 @@ CORPUS: Final[dict[str, Callable[[Path], None]]] = {
     "zeros.mat": zeros_mat,
     "wide.csv": wide_csv,
     "tall.csv": tall_csv,
+    "zeros.csv": zeros_csv,
+    "beyond.csv": beyond_csv,
     "headless.csv": headless_csv,
     "markup.mcap": markup_recording,
     "devices.mcap": many_devices,

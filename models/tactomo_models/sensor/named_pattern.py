@@ -108,6 +108,7 @@ class NamedPattern(NamedTuple):
             raise DescriptionError(f"{description.name!r} with {self}: {why}") from error
 
 
+@np.errstate(over="ignore", invalid="ignore")  # no pattern fits zeros, or what is beyond numbers
 def fitting_patterns(scans: FloatArray) -> list[NamedPattern]:
     """Patterns that scans (T, M) may have, by their count and zeros, and then by reciprocity.
 

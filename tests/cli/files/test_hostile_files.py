@@ -21,7 +21,7 @@ QUICK: Final = {
     "info": ("boastful.npz", "crowd.eit", "markup.mcap", "marks.mcap", "pipe.csv"),
     "plot": ("timeless.mcap",),
     "replay": ("piped.mcap",),
-    "reconstruct": ("pipe.npz", "beyond.npz"),
+    "reconstruct": ("pipe.npz", "beyond.npz", "beyond.csv", "zeros.csv"),
 }
 
 
