@@ -415,9 +415,11 @@ class Imaging:
         started_s = time.perf_counter()
         self.frame_rate.add(time.monotonic_ns())  # first: what was seen is counted
         header = frames.frame_header(dual, timing, frame)
-        self._publisher.publish(CONTACTS, frames.contacts_fields(dual.counter, frame), header)
         active = self._recorder.active
-        if self._publisher.wants(MAP) or (active is not None and active.with_maps):
+        # before the contacts: who hears them and then asks for maps gets the next one's
+        wants_map = self._publisher.wants(MAP) or (active is not None and active.with_maps)
+        self._publisher.publish(CONTACTS, frames.contacts_fields(dual.counter, frame), header)
+        if wants_map:
             fields = frames.map_fields(dual.counter, frame, self._description)
             self._publisher.publish(MAP, fields, header)
         self._time("publish", time.perf_counter() - started_s)
