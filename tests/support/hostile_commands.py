@@ -37,6 +37,8 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
         "presses": ("evaluate", "presses", "FILE", "--train", "10"),
         "ktc": ("evaluate", "ktc", "FILE"),
         "measured": ("evaluate", "measured", "FILE"),
+        "model": ("models", "import", "FILE", "OUT.toml"),
+        "teach": ("teach", "fit", "FILE", "-d", "tank_disc", "-o", "OUT.npz"),
         "load_cell": ("calibrate", "fit", "FILE", "--recording", "GOOD.npz"),
         "robot": ("export", "GOOD.mcap", "OUT", "--lerobot", "--robot", "FILE"),
     },
@@ -56,6 +58,10 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
         "reconstruct": ("reconstruct", "GOOD.npz", "OUT.npz", "-d", "FILE"),
         "config": ("daemon", "FILE"),
     },
+    "drawing": {
+        "info": ("info", "FILE"),
+        "model": ("models", "import", "FILE", "OUT.toml"),
+    },
     "kept": {
         "info": ("info", "FILE"),
         "calibration": ("reconstruct", "GOOD.npz", "OUT.npz", "--calibration", "FILE"),
@@ -63,7 +69,13 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
         "show": ("calibrate", "show", "FILE"),
     },
 }
-KINDS: Final = {".mcap": "recording", ".toml": "description", ".json": "kept"}
+KINDS: Final = {
+    ".mcap": "recording",
+    ".toml": "description",
+    ".json": "kept",
+    ".svg": "drawing",
+    ".dxf": "drawing",
+}
 ENDS: Final = (".npz", ".mcap")
 RATIONED: Final = """
 import json, os, sys

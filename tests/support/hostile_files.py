@@ -18,6 +18,7 @@ from typing import Final
 
 import numpy as np
 import zstandard
+from ezdxf.filemanagement import new
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 from tactomo.recordings.recording import Origin
@@ -327,6 +328,24 @@ def crowded_eit(path: Path) -> None:
     path.write_text("\n".join(head) + "\n1 2\n1 1" * (2 * MEGABYTE - 20))
 
 
+def beyond_svg(path: Path) -> None:
+    """An electrode beyond numbers: GEOS ends the process on it."""
+    path.write_text(
+        '<svg xmlns="http://www.w3.org/2000/svg" width="9mm" height="9mm">'
+        '<rect width="9" height="9"/><g id="electrodes"><circle r="1e308"/><circle r="1"/></g>'
+        "</svg>"
+    )
+
+
+def beyond_dxf(path: Path) -> None:
+    """The same by another program."""
+    document = new(units=4)
+    document.modelspace().add_lwpolyline([(0, 0), (9, 0), (9, 9), (0, 9)], close=True)
+    for radius in (1.0, 1e308):
+        document.modelspace().add_circle((0, 0), radius, dxfattribs={"layer": "electrodes"})
+    document.saveas(path)
+
+
 def pipe(path: Path) -> None:
     """A pipe that nobody writes to."""
     os.mkfifo(path)
@@ -382,6 +401,8 @@ CORPUS: Final[dict[str, Callable[[Path], None]]] = {
     "deep.json": deep_json,
     "long.eit": long_eit,
     "crowd.eit": crowded_eit,
+    "beyond.svg": beyond_svg,
+    "beyond.dxf": beyond_dxf,
     **{f"pipe{suffix}": pipe for suffix in (".npz", ".mat", ".csv", ".eit", ".mcap", ".toml")},
     **{f"device{suffix}": endless for suffix in (".npz", ".mat", ".csv", ".eit", ".mcap", ".toml")},
     "folder.mcap": folder,

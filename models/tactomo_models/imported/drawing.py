@@ -25,6 +25,7 @@ MAX_BYTES: Final = 5_000_000
 MAX_PARTS: Final = 20_000
 """Lines, blocks and groups, as often as they are drawn: a kilobyte may draw one a billion times."""
 MAX_POINTS: Final = 200_000
+MAX_MM: Final = 1e15  # from the drawing's origin: GEOS ends the process beyond numbers
 PART_BYTES: Final = 50  # of an SVG path are a part: its reader is slow
 CLOSED_PARTS: Final = 2  # parts of each closed line of an SVG path: its reader walks back for it
 MAX_LINES: Final = 5_000
@@ -69,7 +70,8 @@ def read_drawing(
     read = _dxf if path.suffix.lower() == ".dxf" else _svg
     content = read_regular(path, MAX_BYTES)
     try:
-        lines = list(_bounded(read(content, unit_mm, wanted)))
+        with np.errstate(over="ignore", invalid="ignore"):  # `_bounded` tells
+            lines = list(_bounded(read(content, unit_mm, wanted)))
     except (ImportError, DataError):
         raise
     except Exception as error:  # parsers raise almost anything
@@ -97,7 +99,17 @@ def _bounded(lines: Iterator[Line]) -> Iterator[Line]:
         points += len(line.points)
         if number == MAX_PARTS or points > MAX_POINTS:
             raise _too_much()
+        _check_places(line.points)
         yield line
+
+
+def _check_places(points_mm: FloatArray) -> None:
+    """Raise DataError where a line goes so far that GEOS ends the process, or flattens no curve."""
+    if not (np.abs(points_mm) < MAX_MM).all():
+        raise DataError(
+            f"a line of the drawing goes beyond {MAX_MM * 1e-6:,.0f} km, or to no place at all; "
+            "delete it, or give the drawing's --unit-mm"
+        )
 
 
 def _too_much() -> DataError:
@@ -163,7 +175,9 @@ def _dxf(
             except TypeError:  # no line, such as a text of a block
                 continue
             for sub in drawn.sub_paths():
-                size = np.ptp([tuple(point) for point in sub.control_vertices()], axis=0).max()
+                corners = np.array([tuple(point) for point in sub.control_vertices()])
+                _check_places(unit_mm * corners)
+                size = np.ptp(corners, axis=0).max()
                 flat = max(FLAT_MM / unit_mm, FLAT_SHARE * size)
                 points = np.array([(p.x, p.y) for p in sub.flattening(flat)])
                 yield Line(layer, unit_mm * points)

@@ -20,6 +20,7 @@ from tactomo_models import SkinSimulator, load_description
 QUICK: Final = {
     "info": ("boastful.npz", "crowd.eit", "markup.mcap", "marks.mcap", "pipe.csv"),
     "plot": ("timeless.mcap",),
+    "model": ("beyond.svg",),
     "replay": ("piped.mcap",),
     "reconstruct": ("pipe.npz", "beyond.npz", "beyond.csv", "zeros.csv"),
 }
