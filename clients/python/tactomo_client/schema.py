@@ -329,7 +329,8 @@ class Events:
     #: The reference was not taken: the scans differ too much (somebody presses), or no scans came
     tare_refused = WARNING
     #: By the reference kept from before, something seems to lie on the skin: the kept reference
-    #: stays in use. Or a tare was taken while contacts were shown. See the flag of this name
+    #: stays in use. Or a tare was taken while contacts were shown, or right after such a tare and
+    #: under the same load. See the flag of this name
     reference_disputed = WARNING
     #: At the start, neither drift nor contacts explain the difference from the kept reference: the
     #: skin seems to be another one. The new reference is used

@@ -58,6 +58,16 @@ class Doubt:
 
     ends_at_rest: bool = False  # whether a quiet frame ends it: an older reference is in force
     before: KnownSkin | None = None  # by which the skin may be at rest: that of before the tare
+    was_touched: bool = False  # whether contacts were shown since
+    is_quiet: bool = True  # whether the last frame showed nothing
+
+    @property
+    def is_settled_by_hand(self) -> bool:
+        """Whether whoever tares now has touched the skin and let go: what still lies there stays.
+
+        That skin is the one that is meant: nothing else can tell it from a loaded one.
+        """
+        return self.was_touched and self.is_quiet
 
 
 class Imaging:
@@ -165,7 +175,8 @@ class Imaging:
     def _take(self, tare: Tare, is_asked: bool, contacts: int) -> bool:
         """Use a reference that was taken; at the start only if nothing lies on the skin.
 
-        One that was taken while contacts were shown is disputed, and not kept for the next start.
+        One that was taken while contacts were shown is disputed, and not kept for the next start;
+        so is the next one, if contacts explain how it differs from the one before the dispute.
         Returns whether it is in force.
         """
         reference = tare.reference
@@ -183,8 +194,10 @@ class Imaging:
                 )
         is_first = not is_asked and self.reference is None
         is_unreadable = is_first and self._kept is not None and self._kept.is_unreadable
-        before = self._known_before() if contacts else None
-        self._doubt = Doubt(before=before) if contacts or is_unreadable else None
+        is_still_loaded = not contacts and self._is_still_loaded(reference)
+        before = self._known_before() if contacts or is_still_loaded else None
+        is_disputed = contacts or is_still_loaded or is_unreadable
+        self._doubt = Doubt(before=before) if is_disputed else None
         self._use(tare, wall_clock_ns())
         if contacts:
             self._on_event(
@@ -192,9 +205,26 @@ class Imaging:
                 f"the reference was taken, and shown meanwhile: {counted(contacts, 'contact')}",
                 "take everything off the skin; if contacts are still shown then: `tactomo tare`",
             )
+        elif is_still_loaded:
+            self._on_event(
+                "reference_disputed",
+                "the reference was taken, and contacts explain how it differs from the one before "
+                "the dispute: something still seems to lie on the skin",
+                "take everything off the skin; if something is to stay on it: press beside that, "
+                "let go, and `tactomo tare`",
+            )
         elif self._kept is not None and self._doubt is None:
             self._kept.keep(reference, self.calibration.device_ids)
         return True
+
+    def _is_still_loaded(self, reference: Reference) -> bool:
+        """Whether a tare with nothing shown was taken under what disputed the one before it."""
+        doubt = self._doubt
+        if doubt is None or doubt.before is None or doubt.is_settled_by_hand:
+            return False
+        before = doubt.before
+        found = skin_at_start(self._reconstructor, before.reference, reference, before.age_s)
+        return found is SkinAtStart.LOADED
 
     def _known_before(self) -> KnownSkin | None:
         """The newest reference that was taken while nothing was shown."""
@@ -326,6 +356,8 @@ class Imaging:
             detail = "the skin is at rest by the reference that was kept"
             self._on_event("reference_confirmed", detail)
             return frame
+        was_touched = doubt.was_touched or bool(frame.contacts)
+        self._doubt = replace(doubt, was_touched=was_touched, is_quiet=frame.tier == "quiet")
         return replace(frame, flags=frame.flags | Flag.REFERENCE_DISPUTED)
 
     def _restore(self, known: KnownSkin) -> None:

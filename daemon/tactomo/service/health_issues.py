@@ -42,7 +42,8 @@ FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
     ),
     "reference_disputed": (
         "at the start, or at the tare, something seemed to lie on the skin",
-        "take everything off; if contacts are still shown then, run `tactomo tare`",
+        "take everything off; if contacts are still shown then, run `tactomo tare`; if this stays, "
+        "touch the skin, let go, and tare again",
     ),
     "no_usable_scan": (
         "nothing is measured: no contacts does not mean nothing pressed",

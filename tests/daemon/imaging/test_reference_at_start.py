@@ -27,6 +27,13 @@ def volts(is_held: bool) -> Volts:
     return skin.voltages(HELD if is_held else [])
 
 
+@cache
+def touched() -> Volts:
+    """Beside what is held."""
+    skin = SkinSimulator(load_description("paper_square"), spacing_m=0.008)
+    return skin.voltages([*HELD, Press(0.0, 0.0, 180.0)])
+
+
 @pytest.fixture
 def begin(bench: Start) -> Callable[..., Any]:
     """Start a daemon that tares on these voltages, or on one after the other of them."""
@@ -95,17 +102,25 @@ def test_a_status_between_the_first_reference_and_its_first_frame_is_of_a_tared_
 
 
 @pytest.mark.slow
-def test_two_tares_on_command_override_the_reference_that_was_kept(begin: Any) -> None:
+def test_tares_under_a_press_are_disputed_until_somebody_touches_beside_it_and_tares(
+    begin: Any,
+) -> None:
     once(begin)
     kept = reference_path("left").read_bytes()
     b = begin(volts(True))
     b.listener.event("reference_disputed")
-    for is_disputed in (True, False):  # contacts are shown during the first, none during the other
+    for _ in range(3):  # contacts are shown during the first, none during the others
         tare(b, volts(True))
         frame = b.step(volts=volts(True))
         assert frame["contacts"] == []
-        assert ("reference_disputed" in frame["flags"]) == is_disputed
-        assert reference_path("left").read_bytes() == kept or not is_disputed
+        assert "reference_disputed" in frame["flags"]
+        assert reference_path("left").read_bytes() == kept
+    assert len(b.step(volts=touched())["contacts"]) == 1
+    tare(b, volts(True))
+    frame = b.step(volts=volts(True))
+    assert frame["contacts"] == []
+    assert "reference_disputed" not in frame["flags"]
+    assert reference_path("left").read_bytes() != kept
     b.daemon.stop()
     again = begin(volts(True))  # it is what the sensor was last known as
     again.listener.event("tared")

@@ -9,8 +9,10 @@ from typing import Any
 
 import pytest
 from daemon_bench import Memory
+from tactomo.imaging import imaging
 from tactomo_client.messages import array_from_wire
 from tactomo_models import Reference
+from tactomo_models.commissioning.known_skin import SkinAtStart
 
 
 def pressed(frame: dict[str, Any]) -> float:
@@ -136,13 +138,19 @@ def test_a_light_press_is_no_rest_by_the_reference_before_the_tare(
     assert b.step(0.0)["flags"] == []
 
 
-def test_a_second_tare_with_nothing_shown_settles_it(bench: Callable[..., Any]) -> None:
+@pytest.mark.parametrize("found", [SkinAtStart.KNOWN, SkinAtStart.LOADED, SkinAtStart.OTHER])
+def test_a_second_tare_with_nothing_shown_settles_it_unless_contacts_explain_it(
+    bench: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, found: SkinAtStart
+) -> None:
+    monkeypatch.setattr(imaging, "skin_at_start", lambda *_: found)
     b = bench().tare()
     b.step(0.2)
     tare_under(b, 0.2)
     b.until(lambda: abs(pressed(b.step(0.2))) < 0.01)
     tare_under(b, 0.2)
-    assert b.step(0.2)["flags"] == []
+    is_disputed = found is SkinAtStart.LOADED
+    assert b.step(0.2)["flags"] == ["reference_disputed"] * is_disputed
+    assert b.step(0.0)["flags"] == [], "at rest by the reference before both"
 
 
 def test_who_asks_while_a_reference_is_found_out_about_shares_the_next_one(
