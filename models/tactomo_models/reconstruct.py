@@ -417,6 +417,15 @@ class Reconstructor:
         if self.description.mount is not None:
             contacts = mounted(contacts, self.description.mount)
         force_n, force_sigma_n = total_force(contacts, self.curve, field)
+        companions = _judged(measurement, estimate.companions)
+        if contacts and np.isnan(force_sigma_n):
+            # The sheets tell a least force, or none; what feels all of the sheet tells all of it.
+            whole = [
+                (one.sigma_n, one.force_n)
+                for name, one in companions.items()
+                if one.state == "fitted" and self.description.companion[name].region_m is None
+            ]
+            force_sigma_n, force_n = min(whole, default=(force_sigma_n, force_n))
         pressure = None
         if estimate.tells_pressure and has_magnitude:
             pressure = pressure_map(areas, contacts, account.pressure_kpa if account else None)
@@ -434,7 +443,7 @@ class Reconstructor:
             confidence=estimate.confidence,
             force_n=force_n,
             force_sigma_n=force_sigma_n,
-            companions=_judged(measurement, estimate.companions),
+            companions=companions,
         )
 
     def _areas_of(self, estimate: Estimate) -> tuple[Areas, FloatArray, FloatArray]:

@@ -214,11 +214,12 @@ class Contacts(Envelope):
     #: and every touch is seen (see Stale, or nothing pressed?)
     contacts: tuple[Contact, ...]
     #: Force of all contacts together: 0 where nothing is pressed, nil where the force of a contact
-    #: is nil, a lower bound where a contact is ``above``
+    #: is nil, a lower bound where a contact is ``above``. In these two cases, the force of a fitted
+    #: companion of the whole sheet is told, where there is one
     force_n: float | None = None
     #: Standard uncertainty of `force_n`. Smaller than the root sum of squares where contacts touch:
-    #: their errors cancel. Nil where the uncertainty of a contact's force is nil, and where nothing
-    #: is pressed
+    #: their errors cancel. Nil where the uncertainty of a contact's force is nil and no companion
+    #: tells it, and where nothing is pressed
     force_sigma_n: float | None = None
 
 

@@ -14,6 +14,7 @@ from tactomo_models import (
     DataError,
     Flag,
     Press,
+    PressureRange,
     Reconstructor,
     SensorDescription,
     SkinSimulator,
@@ -76,6 +77,19 @@ def test_a_force_is_surer_with_a_load_cell(reconstructor: Reconstructor, scan: F
     # Flat or falling, the sheet alone does not tell, and a falling pressure has no bound.
     assert np.isnan(alone.force_sigma_n)
     assert both.force_sigma_n < 0.01 * BALL_N
+
+
+def test_a_load_cell_tells_all_force_where_the_sheet_tells_a_bound(
+    reconstructor: Reconstructor, skin: Skin
+) -> None:
+    """The bound of one contact was taken from the table's end: less than the cell allowed for."""
+    hard, light = Press(-0.03, 0.0, 285.0, 0.009), Press(0.035, 0.02, 150.0, 0.012)
+    wanted = 1e3 * np.pi * (285 * 0.009**2 + 150 * 0.012**2)
+    frame = cold(reconstructor, skin.scan(hard, light)["magnitude"], wanted)
+    assert PressureRange.ABOVE in [contact.pressure_range for contact in frame.contacts]
+    cell = frame.companions["load_cell"]
+    assert cell.state == "fitted"
+    assert (frame.force_n, frame.force_sigma_n) == (cell.force_n, cell.sigma_n)
 
 
 @pytest.mark.parametrize("factor", [0.0, 2.0, 3.0])

@@ -138,11 +138,12 @@ struct FrameFields {
     /// stale and every touch is seen (see Stale, or nothing pressed?).
     std::vector<Contact> contacts;
     /// Force of all contacts together: 0 where nothing is pressed, nil where the force of a contact
-    /// is nil, a lower bound where a contact is `above`.
+    /// is nil, a lower bound where a contact is `above`. In these two cases, the force of a fitted
+    /// companion of the whole sheet is told, where there is one.
     std::optional<double> force_n;
     /// Standard uncertainty of `force_n`. Smaller than the root sum of squares where contacts
-    /// touch: their errors cancel. Nil where the uncertainty of a contact's force is nil, and where
-    /// nothing is pressed.
+    /// touch: their errors cancel. Nil where the uncertainty of a contact's force is nil and no
+    /// companion tells it, and where nothing is pressed.
     std::optional<double> force_sigma_n;
     /// |Δσ|/σ₀ of the magnitude channel at each node; `map[iy][ix]`, row 0 at the bottom. Unit:
     /// ratio.
