@@ -335,6 +335,12 @@ class SensorDescription(Section):
         return np.asarray(self.electrode_ends_m.mean(axis=1))
 
     @cached_property
+    def pad_radii_m(self) -> FloatArray:
+        """Radius of every pad, (electrodes,); NaN of an electrode on a rim."""
+        placed = self.placed_electrodes
+        return np.array([each.radius_m if isinstance(each, Pad) else np.nan for each in placed])
+
+    @cached_property
     def rim_order(self) -> IntArray:
         """Place of each electrode round the outer rim, from 0, (electrodes,); -1 elsewhere."""
         length_m = self.sheet.outline.lengths_m[0]

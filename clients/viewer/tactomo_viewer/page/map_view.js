@@ -40,7 +40,7 @@ export class MapView {
     this.canvas = canvas;
     this.context = canvas.getContext("2d");
     this.picture = document.createElement("canvas");  // the image, one pixel a node
-    this.sheet = { x: [-75, 75], y: [-75, 75], electrodes: [], sensing: [] };
+    this.sheet = { x: [-75, 75], y: [-75, 75], electrodes: [], padRadii: [], sensing: [] };
     this.sheet.outline = [box(this.sheet)];
     this.tables = {};
     this.resize();
@@ -56,6 +56,7 @@ export class MapView {
       y: [-h / 2, h / 2],
       sensing: list(description.sensing_outline_mm),
       electrodes: list(description.electrodes_mm),
+      padRadii: list(description.pad_radii_mm),
     };
     const outline = list(description.outline_mm);
     this.sheet.outline = outline.length ? outline : [box(this.sheet)];
@@ -308,9 +309,10 @@ export class MapView {
     sheet.electrodes.forEach(([x, y], i) => this.#electrode(c, x, y, i));
   }
 
-  // A bar along the edge of the outline that is nearest, and its number inside.
+  // A bar along the edge of the outline that is nearest, and its number inside; or a pad with its number.
   #electrode(c, x, y, i) {
     const { sheet, plot } = this;
+    if (sheet.padRadii[i]) return this.#pad(c, x, y, i, sheet.padRadii[i] * plot.scale);
     const [dx, dy] = nearestEdge(sheet.outline, x, y).along;
     if (!plot.narrow) {
       const at = [x - (dy * 13) / plot.scale, y + (dx * 13) / plot.scale];
@@ -332,6 +334,21 @@ export class MapView {
     c.strokeStyle = this.theme.background;
     c.stroke();
     c.restore();
+  }
+
+  #pad(c, x, y, i, radius) {
+    const [px, py] = this.mmToPixel(x, y);
+    c.beginPath();
+    c.arc(px, py, Math.max(radius, 2), 0, 2 * Math.PI);
+    c.strokeStyle = this.theme.electrode;
+    c.lineWidth = 2;
+    c.stroke();
+    if (this.plot.narrow) return;
+    c.font = `10px ${this.theme.font}`;
+    c.fillStyle = "rgba(255, 255, 255, 0.55)";
+    c.textAlign = "center";
+    c.textBaseline = "middle";
+    c.fillText(String(i), px, radius > 8 ? py : py - radius - 8);
   }
 
   #axes(c) {

@@ -10,6 +10,7 @@ import typer
 
 from tactomo.cli.options import examples, typer_app
 from tactomo.cli.output import say
+from tactomo.cli.plot.electrodes import draw_electrodes, outwards
 from tactomo.cli.plot.plot import prepare_picture, save_figure
 from tactomo.plain import plain
 
@@ -121,18 +122,28 @@ def _title(description: SensorDescription, scale: float) -> str:
     size = f"{1e3 * description.width_m:g} × {1e3 * description.height_m:g} mm"
     return (
         f"{description.name}: {size}, {_scale_in_words(scale)}, seen from the pressed side\n"
-        f"{description.electrode_count} electrodes, {1e3 * description.electrodes.length_m:g} mm "
-        f"long; {description.measurements} voltages: {description.pattern}\n"
+        f"{_electrodes_in_words(description)}; {description.measurements} voltages: "
+        f"{description.pattern}\n"
         f"map {map_.nodes_x} × {map_.nodes_y} nodes, {step_x:.3g} × {step_y:.3g} mm apart; "
         f"channels: {', '.join(description.channels)}"
     )
 
 
+def _electrodes_in_words(description: SensorDescription) -> str:
+    electrodes = description.electrodes
+    pads = sum(radius > 0 for radius in description.pad_radii_m)  # NaN of those on the rim
+    words = []
+    if pads < description.electrode_count:
+        on_rim = f"{description.electrode_count - pads} electrodes"
+        words.append(f"{on_rim}, {1e3 * electrodes.length_m:g} mm long")
+    if pads and electrodes.pad_radius_m:
+        words.append(f"{pads} pads, {2e3 * electrodes.pad_radius_m:g} mm across")
+    return "; ".join(words)
+
+
 def _draw_sheet(axes: Axes, description: SensorDescription, paper_mm: float) -> None:
     """The sheet in millimetres; `paper_mm` is what one of them on paper stands for."""
     import numpy as np
-    from matplotlib.patches import Circle
-    from tactomo_models.sensor.outline import Pad
 
     half_x, half_y = 5e2 * description.width_m, 5e2 * description.height_m
     frame_m = description.sheet.frame_width_m
@@ -143,21 +154,10 @@ def _draw_sheet(axes: Axes, description: SensorDescription, paper_mm: float) -> 
     on = description.on_sheet(x, y)
     axes.plot(1e3 * x[on], 1e3 * y[on], ",", color="0.6", zorder=2)
     axes.plot(0, 0, "+", color="0.4", markersize=10, zorder=3)
-    outwards = _outwards(description)
-    placed = zip(description.placed_electrodes, 1e3 * description.electrode_ends_m, strict=True)
-    for number, (electrode, ends) in enumerate(placed):
-        if isinstance(electrode, Pad):
-            axes.add_patch(Circle(ends.mean(axis=0), 1e3 * electrode.radius_m, color="black"))
-        else:
-            axes.plot(
-                *ends.T, color="black", linewidth=4, solid_capstyle="butt", zorder=5, clip_on=False
-            )
-        label_x, label_y = ends.mean(axis=0) + 4 * paper_mm * outwards[number]
-        colour, weight = ("tab:red", "bold") if number == 0 else ("black", "normal")
-        axes.text(
-            label_x, label_y, str(number), ha="center", va="center", color=colour, weight=weight
-        )
-    _draw_pairs(axes, description, outwards, paper_mm)
+    draw_electrodes(
+        axes, description, 4 * paper_mm, {"color": "tab:red", "weight": "bold"}, zorder=7
+    )
+    _draw_pairs(axes, description, paper_mm)
     axes.set(xlim=(-half_x, half_x), ylim=(-half_y, half_y), xlabel="x (mm)", ylabel="y (mm)")
     axes.spines[:].set_visible(False)
     axes.tick_params(pad=24, length=0, labelsize=8, colors="0.4")
@@ -175,21 +175,12 @@ def _draw_outline(axes: Axes, description: SensorDescription, inset_m: float, **
     axes.add_patch(shape)
 
 
-def _outwards(description: SensorDescription) -> Any:
-    """Unit vectors (electrodes, 2) that point off the sheet; up from a pad."""
+def _draw_pairs(axes: Axes, description: SensorDescription, paper_mm: float) -> None:
+    """The first drive pair and the pairs that are measured meanwhile, inside the rim or on pads."""
     import numpy as np
-    from tactomo_models.sensor.outline import Pad
 
-    along = np.diff(description.electrode_ends_m, axis=1)[:, 0]
-    outwards = np.stack([along[:, 1], -along[:, 0]], axis=1)
-    outwards /= np.linalg.norm(along, axis=1)[:, None]
-    outwards[[isinstance(each, Pad) for each in description.placed_electrodes]] = 0.0, 1.0
-    return outwards
-
-
-def _draw_pairs(axes: Axes, description: SensorDescription, outwards: Any, paper_mm: float) -> None:
-    """The first drive pair and the pairs that are measured meanwhile, just inside the rim."""
-    inside = 1e3 * description.electrode_centres_m - 3 * paper_mm * outwards
+    inwards = np.isnan(description.pad_radii_m)[:, None] * -outwards(description)
+    inside = 1e3 * description.electrode_centres_m + 3 * paper_mm * inwards
     pairs = description.pairs
     source, sink = first = pairs.drive[0]
     meanwhile = pairs.measure[(pairs.drive == first).all(axis=1)]

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator
 from tactomo_client import Contact, Frame
 from tactomo_client.appearance import COLOURS, map_pixels, shown_image
 
 from tactomo.cli.files.recorded_frames import Moment
 from tactomo.cli.plot.course import Course, Track
+from tactomo.cli.plot.electrodes import draw_electrodes
 from tactomo.imaging.frames import description_fields
 from tactomo.plain import counted, plain
 
@@ -27,6 +29,7 @@ HEIGHTS_IN: Final = {"pressure": 2.0, "force": 1.5, "misfit": 1.2, "flags": 1.1,
 SIGMAS: Final = 2.0
 GAP_S: Final = 0.5  # without a frame for so long, a line is broken
 INK: Final = "0.25"
+NUMBER_GAP: Final = 0.03  # of electrodes' numbers from them, of the sheet's longer side
 LETTERS: Final = "abcdefghijkl"
 
 
@@ -107,14 +110,30 @@ def draw_strip(
     axes_row = np.atleast_1d(figure.subplots(1, len(frames), sharey=True))
     for axes, frame, title in zip(axes_row, frames, titles, strict=True):
         _draw_map(axes, frame, about)
+        if description is not None:
+            _cut_out(axes, description)
         axes.set_title(title, fontsize=10)
     axes_row[0].set_ylabel("y (mm)")
     known = [s for frame in frames if (s := shown_image(frame, about))]
     if known:
         colours = LinearSegmentedColormap.from_list("map", np.array(COLOURS) / 255)
         scale = ScalarMappable(Normalize(0, known[0][1]), colours)
-        beside_last = axes_row[-1].inset_axes((1.05, 0.0, 0.06, 1.0))
+        left, right, bottom, top = axes_row[-1].axis()
+        narrow = max(1.0, (top - bottom) / (right - left))  # a bar is as wide beside any map
+        beside_last = axes_row[-1].inset_axes((1 + 0.05 * narrow, 0.0, 0.06 * narrow, 1.0))
         figure.colorbar(scale, cax=beside_last, label=_scale_label(frames[0]))
+
+
+def _cut_out(axes: Any, description: SensorDescription) -> None:
+    """Show a map within the sheet's outline alone."""
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    rings = description.sheet.outline.drawn()
+    closed = [Path(1e3 * np.vstack([ring, ring[:1]]), closed=True) for ring in rings]
+    shape = PathPatch(Path.make_compound_path(*closed), transform=axes.transData)
+    for image in axes.images:
+        image.set_clip_path(shape)
 
 
 def _scale_label(frame: Frame) -> str:
@@ -144,6 +163,7 @@ def _draw_map(axes: Any, frame: Frame, about: dict[str, Any]) -> None:
             ha="center",
             fontsize=7,
             color="white",
+            path_effects=[withStroke(linewidth=2, foreground="0.15")],
         )
 
 
@@ -177,11 +197,10 @@ def _draw_sheet(axes: Any, description: SensorDescription) -> None:
     width, height = description.width_m * 1e3, description.height_m * 1e3
     for ring in description.sheet.outline.drawn():
         axes.fill(*(1e3 * ring.T), fill=False, edgecolor="0.4", linewidth=1.5)
-    for number, (begin, end) in enumerate(description.electrode_ends_m * 1e3):
-        axes.plot(*zip(begin, end, strict=True), color="black", linewidth=4, solid_capstyle="butt")
-        x, y = (begin + end) / 2 * 1.08
-        axes.text(x, y, str(number), ha="center", va="center", fontsize=7, color="0.4")
-    axes.set(xlim=(-0.57 * width, 0.57 * width), ylim=(-0.57 * height, 0.57 * height))
+    gap = NUMBER_GAP * max(width, height)
+    draw_electrodes(axes, description, gap, fontsize=7, color="0.4")
+    half_x, half_y = (side / 2 + 1.8 * gap for side in (width, height))
+    axes.set(xlim=(-half_x, half_x), ylim=(-half_y, half_y))
 
 
 def _draw_track(axes: Any, track: Track, colour: Any) -> None:
