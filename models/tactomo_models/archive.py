@@ -120,6 +120,15 @@ def write_whole(
         raise
 
 
+def check_replaceable(path: Path) -> None:
+    """Raise OSError where no file, but a pipe or a device, has a place of ours.
+
+    For use before `write_whole`, which waits for a pipe, where nobody has named the place.
+    """
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "it is no regular file", str(path))
+
+
 def part_of(path: Path) -> Path:
     """Return the hidden file to write until it is whole; remove those that killed writers left."""
     for left in path.parent.glob(f".{glob.escape(path.name)}.*.part"):

@@ -93,8 +93,8 @@ def test_a_stopped_subscriber(
     beside = [heard.age_ms for heard in ears.heard[before:during]]
     sequences = np.diff([heard.fields["sequence"] for heard in ears.heard])
     figure(
-        f"healthy one: p99 {np.percentile(healthy, 99):.1f} ms before, "
-        f"{np.percentile(beside, 99):.1f} ms beside it, none missed; memory {grown_mb:+.1f} MB; "
+        f"healthy one: {percentiles(healthy)} before, {percentiles(beside)} beside it, none "
+        f"missed; memory {grown_mb:+.1f} MB; "
         f"the stopped one current {current_s:.2f} s after SIGCONT, knows of {missed} missed"
     )
     assert (sequences == 1).all()

@@ -33,6 +33,7 @@ These promises hold:
 - Hostile boards, files and web pages never end the daemon.
 - A frozen converter or drive, a second skin on one daemon and a tare under a press are reported. A
   converter is frozen where a scan lacks noise against one of the last 16; an F test ends a dispute.
+  A second tare under the same press stays disputed.
 
 These limits remain:
 

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 from tactomo_models import DataError, Reference, SensorDescription
-from tactomo_models.archive import read_arrays, write_arrays
+from tactomo_models.archive import check_replaceable, read_arrays, write_arrays
 from tactomo_models.calibration.calibration_file import data_folder
 
 from tactomo.errors import RecordingError
@@ -148,6 +148,7 @@ class KeptReference:
 
     def _write(self, arrays: dict[str, Any]) -> None:
         try:
+            check_replaceable(self._path)
             write_arrays(self._path, arrays)
         except OSError as error:
             self._tell(f"cannot write {self._path}: {error.strerror or error}")

@@ -17,7 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 from platformdirs import user_cache_path
 
-from tactomo_models.archive import map_array, read_arrays, write_whole
+from tactomo_models.archive import check_replaceable, map_array, read_arrays, write_whole
 from tactomo_models.arrays import FloatArray
 from tactomo_models.errors import ArtifactError, DataError, os_errors_as
 from tactomo_models.physics.bare_sheet import BareSheet, solve_bare_sheet
@@ -144,6 +144,7 @@ def save_artifact(artifact: Artifact, path: Path) -> None:
     arrays["content_sha256"] = _sha256_of(arrays)
     next_step = "free some space or name another path"
     with os_errors_as(ArtifactError, f"cannot write {path}", next_step):
+        check_replaceable(path)
         write_whole(path, lambda file: np.savez(file, **arrays))
 
 

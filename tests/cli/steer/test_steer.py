@@ -152,6 +152,36 @@ def test_status_begins_with_what_is_wrong_and_what_to_do(tactomo: Run, control: 
     assert "pid 7, 10.0 % of a core on average, 90.0 MB, 6 threads" in result.stdout
 
 
+HOSTILE = "x[/b]y skin[left] \x1b]0;title\x07\x1b[2J\x9b2J\u202e"
+
+
+def hostile(told: Any) -> Any:
+    """The same with text of a board, a file or a stranger in every place for text."""
+    if isinstance(told, dict):
+        return {key: hostile(value) for key, value in told.items()}
+    if isinstance(told, list):
+        return [hostile(value) for value in told]
+    return told + HOSTILE if isinstance(told, str) else told
+
+
+def test_what_others_call_themselves_is_shown_and_steers_no_terminal(
+    tactomo: Run, control: Any
+) -> None:
+    """In a status, in an event, and in a refusal."""
+    trouble = {"name": "port_lost", "severity": "error", "detail": HOSTILE, "age_s": 240.0}
+    control.answers["status"] = {
+        **hostile({**STATUS, "state": ""}),
+        **{"state": "running", "tier": "fit", "events": {"troubles": [trouble]}},
+        "issues": [{"severity": "error", "what": HOSTILE, "next_step": HOSTILE}],
+    }
+    control.answers["tare"] = ControlError("tare_refused", HOSTILE, HOSTILE)
+    shown = tactomo("status", status=0).stdout
+    refused = tactomo("tare", status=1).stderr
+    for text in (shown, refused):
+        assert "x[/b]y skin[left]" in text
+        assert not re.search("[\x07\x9b\u202e]|\x1b(?!\\[[0-9;]*m)", text)  # colours are ours
+
+
 def test_what_is_lost_is_told_by_counts_of_the_last_minute(tactomo: Run, control: Any) -> None:
     """Whatever the rates say: a dead channel's is 0, and what was long ago is over."""
     idle = {"url": "/dev/ttyACM0", "connected": True, "state": "idle", "problem": None}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -217,6 +218,20 @@ def test_where_nobody_can_tell_what_lay_on_the_skin_every_frame_says_so_until_a_
     b = begin(volts(False))
     tare(b, volts(False))
     assert b.step(volts=volts(False))["flags"] == []
+
+
+@pytest.mark.slow
+def test_a_pipe_in_the_references_place_is_told_and_not_waited_for(begin: Any) -> None:
+    path = reference_path("left")
+    path.parent.mkdir(parents=True)
+    os.mkfifo(path)
+    b = begin(volts(False))
+    assert "no regular file" in b.listener.event("reference_not_kept")["detail"]
+    b.listener.event("tared")
+    tare(b, volts(False))
+    b.ask("record_start", path="a.mcap")  # by the thread that keeps references
+    b.ask("record_stop")
+    b.daemon.stop()
 
 
 @pytest.mark.slow

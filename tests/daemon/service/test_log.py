@@ -45,6 +45,18 @@ def test_a_line_has_its_priority_and_its_pairs(written: io.StringIO) -> None:
     ]
 
 
+@pytest.mark.parametrize("form", ["journal", "text", "json"])
+def test_what_others_call_themselves_steers_no_terminal(
+    monkeypatch: pytest.MonkeyPatch, form: Any
+) -> None:
+    file = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", file)
+    configure_logging("debug", form)
+    log.error("device_changed", detail="x[/b]y \x1b]0;title\x07\x1b[2J\x9b2J")
+    assert "x[/b]y" in file.getvalue()
+    assert not re.search("[\x07\x9b]|\x1b(?!\\[[0-9;]*m)", file.getvalue())  # colours are ours
+
+
 def test_each_line_of_a_traceback_has_the_priority(written: io.StringIO) -> None:
     try:
         raise ValueError("two\nlines")

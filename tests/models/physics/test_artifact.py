@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import resource
 from pathlib import Path
@@ -176,6 +177,16 @@ def test_a_missing_one_is_built_and_kept(small: SensorDescription) -> None:
     steps.clear()
     load_or_build_artifact(small, progress=steps.append)
     assert not steps
+
+
+@pytest.mark.usefixtures("own_cache")
+@pytest.mark.timeout(60)
+def test_a_pipe_in_the_caches_place_is_not_waited_for(small: SensorDescription) -> None:
+    default_path(small).parent.mkdir(parents=True, exist_ok=True)
+    os.mkfifo(default_path(small))
+    told: list[str] = []
+    assert load_or_build_artifact(small, progress=told.append).sensor == "small"
+    assert "no regular file" in told[0]
 
 
 def test_a_cache_that_cannot_be_written_does_not_stop_anybody(
