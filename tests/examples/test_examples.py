@@ -15,11 +15,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import tactomo_client.appearance  # not by the example, under its own clock
+from noisy_skin import Skin
 from recorded_grasp import write_grasp
 from tactomo_client import Contact, Frame, Subscription, subscribe
 from tactomo_client.fake import FakeSensor
+from tactomo_models import Press, Reconstructor, SkinSimulator, load_description
 from waiting import wait_until
 from whole_system import repository
 
@@ -52,9 +55,9 @@ def test_a_program_is_short_and_says_how_it_is_run(program: Path) -> None:
     assert re.search(rf"^(Run|    tactomo).*{program.stem}", told, re.M)
 
 
-def test_six_programs_are_listed_where_a_reader_looks() -> None:
+def test_programs_are_listed_where_a_reader_looks() -> None:
     names = {program.name for program in PROGRAMS}
-    assert len(names) == 6
+    assert len(names) == 7
     for page in ("docs/python.md", "docs/gallery.md"):
         listed = re.findall(r"examples/(\w+\.py)", (repository() / page).read_text("utf-8"))
         assert set(listed) == names, page
@@ -101,6 +104,25 @@ def test_a_sensor_of_ones_own_finds_its_press(run: Run) -> None:
     said = run("own_sensor.py")
     (found,) = re.findall(r"40 voltages: a press at (-?[\d.]+), (-?[\d.]+) mm", said)
     assert [float(number) for number in found] == pytest.approx([20, -10], abs=1)
+
+
+def test_a_laplace_prior_finds_a_press_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is told too high and too small, but the change over all of it is right."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    sensor = load_description("graded_square")
+    skin = Skin(SkinSimulator(sensor, unevenness=0.03))
+    made = Reconstructor(sensor, method="laplace_prior:LaplacePrior")
+    made.set_reference(skin.reference())
+    frame = made.reconstruct(skin.scan(Press(0.02, -0.01, 100.0, 0.018))["magnitude"], None)
+    assert not frame.failure, frame.failure
+    [contact] = frame.contacts
+    assert np.hypot(contact.x_m - 0.02, contact.y_m + 0.01) < 1.5e-3
+    assert frame.map is not None
+    assert sensor.magnitude is not None
+    response = sensor.magnitude.response
+    told = np.interp(100.0, response.pressure_kpa, response.relative_change)
+    cell_m2 = (sensor.map_x_m[1] - sensor.map_x_m[0]) ** 2
+    assert frame.map.sum() * cell_m2 == pytest.approx(told * np.pi * 0.018**2, rel=0.1)
 
 
 def test_a_recording_is_summed_up_by_contact(run: Run, tmp_path: Path) -> None:
