@@ -106,6 +106,11 @@ def _with_surface(described: dict[str, Any], path: Path) -> dict[str, Any]:
                 f"{path}: mount.surface.file = {file!r}: cannot read it: {reason}; name an OBJ "
                 "file by its path from the description"
             ) from error
+        if not text.strip():
+            raise DescriptionError(
+                f"{path}: mount.surface.file = {file!r}: it is empty; export the surface's "
+                "triangles as OBJ"
+            )
         surface["obj"] = text
     return described
 

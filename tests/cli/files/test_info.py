@@ -10,6 +10,7 @@ import pytest
 from fixture_types import Run
 from hostile_files import BAD_DEVICE, BAD_SENSOR, markup_recording
 from scipy.io import savemat
+from variants import rewritten
 
 
 def test_info_of_a_shipped_description(tactomo: Run) -> None:
@@ -17,6 +18,17 @@ def test_info_of_a_shipped_description(tactomo: Run) -> None:
     assert facts["electrodes"] == 16
     assert facts["voltages a scan"] == 208
     assert facts["channels"] == "magnitude, structure"
+
+
+def test_a_sensor_of_too_many_voltages_is_told_before_it_is_wired(
+    tactomo: Run, tmp_path: Path
+) -> None:
+    changes = ("count = 16", "count = 64"), ("drive_offset = 8", "drive_offset = 1")
+    rewritten(
+        tmp_path / "many.toml", "skin_round", *changes, ("length_m = 0.004", "length_m = 1e-3")
+    )
+    facts = json.loads(tactomo("info", "many.toml", "--json").stdout)
+    assert facts["voltages a scan"] == "3904: of files alone, as a live scan has 1024 at most"
 
 
 def test_info_of_a_file_of_arrays(tactomo: Run, tmp_path: Path) -> None:

@@ -186,6 +186,7 @@ def test_a_mount_that_cannot_be_is_named(
         ("v 0 0 0\nv 1 0 0\nv nan 1 0\n", ["line 3", "finite numbers"]),
         ("v 0 0 0\nvt 0 0\nf 1/1 2/2 3/3\n", ["line 3", "vertices that come before"]),
         ("v 0 0 0\n", ["no faces"]),
+        ("\n", ["it is empty"]),
         ("v 0 0 0\nv 1 0 0\nv 2 0 0\nvt 0 0\nvt 1 0\nvt 2 0\n" + FACES, ["no area", "unwrap"]),
     ],
 )

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from tactomo_protocol import MAX_SAMPLES
 
 from tactomo.cli.options import JsonOutput, examples, need_recording, typer_app
 from tactomo.cli.output import print_json
@@ -124,15 +125,17 @@ def _mount_in_words(description: SensorDescription) -> str:
 
 def _description_facts(description: SensorDescription) -> dict[str, Any]:
     width_mm, height_mm = description.width_m * 1e3, description.height_m * 1e3
-    magnitude = description.magnitude
+    magnitude, count = description.magnitude, description.measurements
     return {
         "name": description.name,
-        "title": description.title,
+        **({"title": description.title} if description.title else {}),
         "sheet": f"{description.sheet.shape}, {width_mm:g} x {height_mm:g} mm",
         "electrodes": description.electrode_count,
         **({"mount": _mount_in_words(description)} if description.mount else {}),
         **({"companions": ", ".join(description.companion)} if description.companion else {}),
-        "voltages a scan": description.measurements,
+        "voltages a scan": count
+        if count <= MAX_SAMPLES
+        else f"{count}: of files alone, as a live scan has {MAX_SAMPLES} at most",
         "pattern": str(description.pattern),
         "instrument": f"{description.instrument.voltages} voltages",
         "channels": ", ".join(description.channels),
