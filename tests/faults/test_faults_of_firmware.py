@@ -86,7 +86,7 @@ def foxglove(stream: str, _: Path) -> Iterator[Count]:
     with Family() as family:
         bridge = family.start(
             *("bridge", "foxglove", SENSOR, "--foxglove-port", "0", "--announce"),
-            *("--stream", stream),
+            *("--address", stream),
         ).wait_ready()
         with FoxgloveClient(bridge["url"]) as client:
             yield lambda: sum(client.counts().values())
