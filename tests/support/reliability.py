@@ -43,7 +43,8 @@ These limits remain:
 - At the very first tare, a frozen converter or an object on the skin looks like a skin at rest
   ([what to do](your_own_sensor.md)).
 - A board that sends more than 16 old scans round and round is believed.
-- A wide press that begins lightly may be missing in its first frames.
+- A wide press is missing while noise hides it: on the simulated paper's skin, pads of 60 to 138 mm
+  below 0.1 to 0.7 kPa, whether they come within a second or ten minutes.
 - Scans that one board delays by half a second behind an honest counter can make a sliding press
   look like drift, or like two contacts: pressures and places are then wrong, without a flag.
 - A board that averages its scans over 20 mm of a sliding press can show it as two, without a

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import time
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -58,6 +59,19 @@ def test_garbage_is_counted_and_told_in_few_events_and_costs_nothing_else(bench:
     assert port["connected"]
     told = sum(e["name"] == "corrupt_packets" for e in b.listener.of("event"))
     assert 1 <= told <= 2 + passed_s  # once a second at most
+
+
+def test_a_board_that_calls_itself_otherwise_each_time_is_told_in_few_events(bench: Start) -> None:
+    b = bench().tare()
+    line = b.skin.lines[0]
+    for number in range(100):
+        line.hello = replace(line.hello, device_id=f"board-{number}")
+        line.say(line.hello)
+    b.until(lambda: b.ask("status")["ports"][0]["device"]["device_id"] == "board-99")
+    b.step()
+    told = Counter(event["name"] for event in b.listener.of("event"))
+    assert 1 <= told["device_changed"] <= 10
+    assert told.total() < 30
 
 
 def test_damage_that_is_over_is_not_told_as_present(
