@@ -9,6 +9,7 @@ import pytest
 import skfem
 from tactomo_models import SensorDescription, load_description
 from tactomo_models.arrays import FloatArray
+from tactomo_models.physics.actual_sheet import SheetEstimator
 from tactomo_models.physics.bare_sheet import (
     assemble_sheet,
     scan_voltages,
@@ -95,3 +96,21 @@ def test_a_pad_that_is_moved_with_its_mesh_is_the_pad_described_there(number: in
     counts = np.abs(at_rest) > 0.2 * np.sqrt(np.mean(at_rest**2))
     left = np.linalg.norm(((change - wanted) / at_rest)[counts])
     assert left < 0.15 * np.linalg.norm((wanted / at_rest)[counts])
+
+
+def test_a_tare_finds_pads_that_are_off_their_places() -> None:
+    """Current that left a moved pad looked like no sheet at all: each skin was taken as even."""
+    sensor = sheet_of_pads("rectangle", GRID)
+    sheet = mesh_sheet(sensor, 0.0012, refinements=3)
+    points = sheet.mesh.p.copy()
+    for centre, off in zip(GRID, np.random.default_rng(0).normal(0, 5e-4, len(GRID)), strict=True):
+        apart = ((sheet.mesh.p - np.array(centre)[:, None]) ** 2).sum(axis=0)
+        points[0] += off * np.exp(-0.5 * apart / 0.006**2)
+    moved = replace(sheet, mesh=skfem.MeshTri(points, sheet.mesh.t))
+    voltages = voltages_of(sensor, moved)
+    usable = np.abs(voltages) > 0.2 * np.sqrt(np.mean(voltages**2))
+    even = solve_bare_sheet(sensor, mesh_sheet(sensor, refinements=2))
+    found = SheetEstimator(sensor, even).estimate(voltages, usable, np.full(len(voltages), 1e-3))
+    assert found is not None
+    taken_as_even = scan_voltages(sensor, even.transfer)
+    assert error(found.bare_voltages, voltages) < 0.1 * error(taken_as_even, voltages)
