@@ -356,6 +356,11 @@ def endless(path: Path) -> None:
     path.symlink_to("/dev/zero")
 
 
+def kernel(path: Path) -> None:
+    """What the kernel calls a regular file, and whose end root waits for in vain."""
+    path.symlink_to("/proc/kmsg")
+
+
 def honest_npz(path: Path) -> None:
     """Nothing is the matter with it but its name."""
     np.savez(
@@ -405,6 +410,7 @@ CORPUS: Final[dict[str, Callable[[Path], None]]] = {
     "beyond.dxf": beyond_dxf,
     **{f"pipe{suffix}": pipe for suffix in (".npz", ".mat", ".csv", ".eit", ".mcap", ".toml")},
     **{f"device{suffix}": endless for suffix in (".npz", ".mat", ".csv", ".eit", ".mcap", ".toml")},
+    **{f"kernel{suffix}": kernel for suffix in (".csv", ".mcap", ".json", ".svg")},
     "folder.mcap": folder,
     "folder.npz": folder,
     f"{NAME}.npz": honest_npz,

@@ -160,6 +160,7 @@ def open_regular(path: Path) -> IO[bytes]:
 
     Raises OSError where it cannot be opened, or is no regular file.
     """
-    if not stat.S_ISREG(path.stat().st_mode):
+    is_regular = stat.S_ISREG(path.stat().st_mode)
+    if not is_regular or path.resolve().parts[1] in ("proc", "sys"):  # the kernel's may never end
         raise OSError(errno.EINVAL, "it is no regular file", str(path))
     return path.open("rb")

@@ -18,7 +18,7 @@ from hostile_files import CORPUS
 from tactomo_models import SkinSimulator, load_description
 
 QUICK: Final = {
-    "info": ("boastful.npz", "crowd.eit", "markup.mcap", "marks.mcap", "pipe.csv"),
+    "info": ("boastful.npz", "crowd.eit", "markup.mcap", "kernel.mcap", "marks.mcap", "pipe.csv"),
     "plot": ("timeless.mcap",),
     "model": ("beyond.svg",),
     "replay": ("piped.mcap",),
