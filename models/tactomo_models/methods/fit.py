@@ -296,7 +296,7 @@ class Fit:
             return course.account
         return self._accountant.account(
             belief.account.fitted,
-            measurement.data,
+            belief.judged(measurement.data),
             belief.alternatives,
         )
 

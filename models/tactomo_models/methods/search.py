@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
-from tactomo_models.methods.account import Account, Frame, account_of, descended
+from tactomo_models.methods.account import Account, Frame, account_of, descended, outline_errors
 from tactomo_models.methods.contact_search import ContactSearch
 from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
 from tactomo_models.methods.prediction import Prediction, at_end, predict, with_kind
@@ -36,6 +36,7 @@ from tactomo_models.methods.rivals import (
     turned,
     unasked,
 )
+from tactomo_models.scans.companion_forces import with_outline_errors
 from tactomo_models.scans.stillness import Since, are_still
 from tactomo_models.scene.field_account import Alternative
 from tactomo_models.scene.field_fit import COLD_S, FieldFit, FittedField, Measured
@@ -88,6 +89,11 @@ class Belief:
     done: bool = False  # whether nothing is left to try
     how: str = ""  # in words, what it came from
 
+    def judged(self, measured: Measured) -> Measured:
+        """Data with the errors of outlines that were allowed for when it was fitted."""
+        errors = {name: each.outline_errors for name, each in self.settled_on.items()}
+        return with_outline_errors(measured, errors)
+
     @property
     def alternatives(self) -> list[list[Alternative]]:
         """What else each contact may be, where it is one contact, at odds that a float holds.
@@ -129,17 +135,37 @@ class Search:
         """What is believed after one frame more."""
         if belief is None or belief.account.fitted.solutions.keys() != frame.measured.keys():
             return self._tried(self._cold(frame), frame)
+        frame = replace(frame, measured=belief.judged(frame.measured))
         still, since = self._is_still(belief, frame)
         if still:
             return self._held(replace(belief, since=since, how="still"), frame)
+        frame = self._with_outline_errors(belief.account, frame)
         return self._tried(self._followed(belief, frame), frame)
 
     def _tried(self, belief: Belief, frame: Frame) -> Belief:
         """What is left to try, one thing after the other, as long as the budget lasts."""
+        outlined = belief.account.family.count  # whose outlines' errors are allowed for
+        if any(each.outline_errors is None for each in frame.measured.values()):
+            outlined = 0
         while not belief.done and not frame.budget.over:
+            account = belief.account
+            if account.at_minimum and account.family.count != outlined:
+                frame, outlined = self._with_outline_errors(account, frame), account.family.count
+                belief = self._compared(belief, frame)
             belief = self._advanced(belief, frame)
         explained = frame.likelihood.explains(belief.account.chi_squared)
         return replace(belief, is_explained=explained)
+
+    def _with_outline_errors(self, account: Account, frame: Frame) -> Frame:
+        """The frame, where what the mesh may make of an account's outlines counts as an error."""
+        errors = outline_errors(self.fit, account, frame.measured)
+        return replace(frame, measured=with_outline_errors(frame.measured, errors))
+
+    def _compared(self, belief: Belief, frame: Frame) -> Belief:
+        """The belief held against a frame that is judged otherwise."""
+        fitted = self.fit.compare(belief.account.fitted, frame.measured)
+        account = account_of(self.fit, fitted, frame)
+        return replace(belief, account=account, settled_on=frame.measured)
 
     # From frame to frame
 

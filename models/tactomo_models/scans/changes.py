@@ -50,9 +50,10 @@ class Changes:
     # (M, K) orthonormal directions in which the sheet's conductivity can move changes over their
     # noise
     modes: FloatArray
-    # (M, K) orthonormal directions of weighted changes that are the sheet's own drift, and the
-    # share (K,) of each that is; None where none is allowed for
-    drift: tuple[FloatArray, FloatArray] | None = None
+    # (M, K) changes of one standard deviation each that count as errors: by a drift of the sheet,
+    # and by what the mesh makes of outlines; None where none are allowed for
+    drift: FloatArray | None = None
+    outline_errors: FloatArray | None = None
     # the factor by which most voltages have changed since the tare, and what `signal` is without
     # it; of a quiet scan nobody asks
     factor: float = 1.0
@@ -87,20 +88,31 @@ class Changes:
         Args:
             directions: (M, K) changes of one standard deviation each.
         """
-        drift = self.weight[:, None] * directions
-        along, size, _ = np.linalg.svd(drift, full_matrices=False)
-        return replace(self, drift=(along, 1 - 1 / np.sqrt(1 + size**2)))
+        return replace(self, drift=directions)
+
+    @cached_property
+    def nuisance(self) -> tuple[FloatArray, FloatArray] | None:
+        """Orthonormal directions (M, K) of weighted changes that may be such errors.
+
+        And the share (K,) of what is along each that is taken off.
+        """
+        given = [each for each in (self.drift, self.outline_errors) if each is not None]
+        if not given:
+            return None
+        weighted = self.weight[:, None] * np.concatenate(given, axis=1)
+        along, size, _ = np.linalg.svd(weighted, full_matrices=False)
+        return along, 1 - 1 / np.sqrt(1 + size**2)
 
     @cached_property
     def compiled(self) -> CompiledData:
         """What C knows of them."""
-        return CompiledData(self.change, self.weight, self.drift)
+        return CompiledData(self.change, self.weight, self.nuisance)
 
     def weighted(self, changes: FloatArray) -> FloatArray:
-        """Relative changes (M,) or (M, N) over their errors, less what may be drift."""
+        """Relative changes (M,) or (M, N) over their errors, less what may be no press's."""
         over = (self.weight * changes.T).T
-        if self.drift is not None:
-            along, share = self.drift
+        if self.nuisance is not None:
+            along, share = self.nuisance
             over -= along @ (share * (along.T @ over).T).T
         return over
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -71,6 +71,14 @@ class SheetsAndCompanions(dict[Channel, Changes]):
         weight = np.sqrt(self.inflation) / np.array([one.sigma_n for one in each])
         n_per_kpa = np.array([one.n_per_kpa for one in each])
         return weight[:, None] * n_per_kpa, weight * np.array([one.force_n for one in each])
+
+
+def with_outline_errors(
+    measured: Mapping[Channel, Changes], errors: Mapping[Channel, FloatArray | None]
+) -> Mapping[Channel, Changes]:
+    """The same, where such errors (M, K) of each sheet's outlines are allowed for."""
+    each = {name: replace(one, outline_errors=errors[name]) for name, one in measured.items()}
+    return SheetsAndCompanions(each, measured.companions) if companions_of(measured) else each
 
 
 def companions_of(measured: Mapping[Channel, Changes]) -> Mapping[str, CompanionForce]:

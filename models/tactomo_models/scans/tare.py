@@ -153,13 +153,7 @@ class ChannelTare:
 
     def _error_share_of(self, predicted: FloatArray) -> float:
         """Model error as a share of a change, of a model that predicts this reference (M,)."""
-        least = 0.01
-        # Of a disc of radius r on nodes a distance h apart, fits of one sheet without noise find
-        # place, elongation and size to 0.1 to 0.15 of the square of h / r, relative to r. With this
-        # factor the paper's sensor has the least; on an insole (4 mm, 1.8 %) mixed presses have
-        # 35 % of their peaks right and 4 % surely wrong with 2 %, 30 and 17 % with 1 %.
-        of_mesh, typical_m = 0.16, 0.012
-        least = max(least, of_mesh * (self._sensor.description.spacing_m / typical_m) ** 2)
+        least = 0.01  # beside what the mesh makes of outlines, see `account.outline_errors`
         # A model that is wrong about the reference is wrong about the changes, too, if less: most
         # of its error divides out.
         mismatch_share = 1 / 3
