@@ -148,7 +148,7 @@ def test_what_is_held_is_judged_by_the_new_frame(skin: Skin) -> None:
     belief = search.advance(None, skin.frame(LEFT))
     frame = skin.frame(LEFT)
     again = search.advance(belief, frame)
-    left = skin.sensor.fit.compare(belief.account.fitted, frame.measured).residual
+    left = skin.sensor.fit.compare(belief.account.fitted, belief.judged(frame.measured)).residual
     np.testing.assert_array_equal(again.account.fitted.residual, left)
 
 

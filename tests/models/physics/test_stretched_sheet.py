@@ -151,7 +151,8 @@ def test_contacts_on_a_stretched_sheet_are_where_and_as_large_as_they_are(
             errors_m[known.name].append(off)
             errors_n[known.name].append(abs(found.force_n / (180e3 * np.pi * 0.008**2) - 1))
     assert max(errors_m["stretched"]) < 0.5e-3
-    # So few electrodes leave open whether the pressure falls towards the edge: two thirds of it.
-    assert np.mean(errors_n["stretched"]) < 0.2
+    # So few electrodes leave open whether the pressure falls towards the edge, beyond the table: a
+    # force is then told as its bound, two thirds of it.
+    assert max(errors_n["stretched"]) < 1 / 3
     is_wrong = max(errors_m["small"]) > 5 * max(errors_m["stretched"])
     assert is_wrong or np.mean(errors_n["small"]) > 0.25
