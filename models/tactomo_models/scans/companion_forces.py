@@ -78,7 +78,8 @@ def with_outline_errors(
 ) -> Mapping[Channel, Changes]:
     """The same, where such errors (M, K) of each sheet's outlines are allowed for."""
     each = {name: replace(one, outline_errors=errors[name]) for name, one in measured.items()}
-    return SheetsAndCompanions(each, measured.companions) if companions_of(measured) else each
+    companions = companions_of(measured)
+    return SheetsAndCompanions(each, companions) if companions else each
 
 
 def companions_of(measured: Mapping[Channel, Changes]) -> Mapping[str, CompanionForce]:
