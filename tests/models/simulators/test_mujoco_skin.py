@@ -114,6 +114,21 @@ def test_what_reaches_over_the_border_is_cut_and_counted() -> None:
     assert truth_n(touch) == pytest.approx(touch.force_n, rel=0.1)
 
 
+def test_a_sheet_of_any_outline_feels_what_lies_within_it() -> None:
+    """Of two balls on a plate, one presses where the L-shaped palm has none."""
+    palm = load_description("palm_l")
+    touch = felt(
+        body("on", BALL, -30, -20, 60),
+        body("off", BALL, 30, 30, 60),
+        description=palm,
+        method="fit",
+    )
+    assert touch.force_n == pytest.approx(60, rel=0.01)
+    assert [(each.body, each.where) for each in touch.outside] == [("off", "off the sheet")]
+    (contact,) = touch.frame.contacts
+    assert (contact.x_m * 1e3, contact.y_m * 1e3) == pytest.approx((-30, -20), abs=1)
+
+
 def test_contacts_outside_the_sheet_are_named_and_press_nothing() -> None:
     behind = 'type="sphere" size=".02" pos="0 0 -.02"'
     touch = felt(body("finger", BALL, 86, 0, 30), body("strap", behind, 10, 10, 20, -20))
