@@ -525,8 +525,8 @@ class SensorDescription:
     sensing_outline_mm: tuple[tuple[tuple[float, float], ...], ...] = ()
     #: Centre of each electrode, x and y, electrode 0 first
     electrodes_mm: tuple[tuple[float, float], ...] = ()
-    #: Radius of each electrode that is a round pad inside the sheet; nil for those on a rim
-    pad_radii_mm: tuple[float | None, ...] = ()
+    #: Radius of each electrode that is a round pad inside the sheet; 0 of those on a rim
+    pad_radii_mm: tuple[float, ...] = ()
     modalities: tuple[str, ...] = ()  #: The sensor's channels: ``magnitude``, ``structure``
     magnitude_max: float | None = None  #: As in ``map``. Unit: ratio.
     #: Highest pressure of the response in force: the calibration's, else the description's

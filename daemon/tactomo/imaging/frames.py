@@ -118,7 +118,7 @@ def description_fields(description: SensorDescription) -> dict[str, Any]:
         "outline_mm": _rings_mm(description, 0.0),
         "sensing_outline_mm": _rings_mm(description, description.sheet.frame_width_m),
         "electrodes_mm": (description.electrode_centres_m * MM_PER_M).tolist(),
-        "pad_radii_mm": [_finite(radius * MM_PER_M) for radius in description.pad_radii_m],
+        "pad_radii_mm": (np.nan_to_num(description.pad_radii_m) * MM_PER_M).tolist(),
         "modalities": list(description.channels),
         "magnitude_max": magnitude_max(description),
         "mount": description.mount and mount_fields(description, description.mount),

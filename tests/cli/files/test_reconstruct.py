@@ -33,7 +33,7 @@ def test_a_press_is_found_in_a_file(tactomo: Run, tmp_path: Path) -> None:
     write_scans(tmp_path / "in.npz", None, Press(x_m=-0.03, y_m=0.03, pressure_kpa=180.0))
     result = tactomo("reconstruct", "in.npz", "out.npz", status=0)
     assert "wrote out.npz: 2 frames\nno frame is flagged\n" in result.stdout
-    assert re.search(r"1 +-30\.\d +\d\d\.\d .* 18\d ± \d kPa", result.stdout)
+    assert re.search(r"1 +-30\.\d +\d\d\.\d .* (179|18[01]) ± \d kPa", result.stdout)
     with np.load(tmp_path / "out.npz") as maps:
         assert maps["map"].shape == (2, 51, 51)
         assert maps["contact_frame"].tolist() == [1]

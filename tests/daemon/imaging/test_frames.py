@@ -112,11 +112,11 @@ def test_the_sensor_is_in_millimetres() -> None:
     fields = description_fields(SENSOR)
     assert (fields["width_mm"], fields["sensing_width_mm"]) == pytest.approx((150.0, 138.0))
     assert np.ptp(np.array(fields["electrodes_mm"])[:, 0]) > 100
-    assert fields["pad_radii_mm"] == [None] * SENSOR.electrode_count
+    assert fields["pad_radii_mm"] == [0.0] * SENSOR.electrode_count
     palm = load_description("palm_l")
     places = (*(palm.electrodes.positions_m or ()), (-0.03, 0.02))
     padded = variant(palm, electrodes={"positions_m": places, "pad_radius_m": 0.003})
-    assert description_fields(padded)["pad_radii_mm"] == [*[None] * (len(places) - 1), 3.0]
+    assert description_fields(padded)["pad_radii_mm"] == [*[0.0] * (len(places) - 1), 3.0]
 
 
 def test_a_frame_was_acquired_before_its_last_byte_came() -> None:

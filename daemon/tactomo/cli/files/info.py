@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from tactomo_protocol import MAX_SAMPLES
 
 from tactomo.cli.options import JsonOutput, examples, need_recording, typer_app
 from tactomo.cli.output import print_json
@@ -124,6 +123,8 @@ def _mount_in_words(description: SensorDescription) -> str:
 
 
 def _description_facts(description: SensorDescription) -> dict[str, Any]:
+    from tactomo_protocol import MAX_SAMPLES
+
     width_mm, height_mm = description.width_m * 1e3, description.height_m * 1e3
     magnitude, count = description.magnitude, description.measurements
     return {
