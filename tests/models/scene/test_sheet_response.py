@@ -32,7 +32,7 @@ def conductivity(response: SheetResponse, at: FloatArray) -> tuple[float, FloatA
 
 @pytest.mark.parametrize("name", RESPONSES)
 @given(
-    st.floats(0.01, 1),
+    st.floats(0.01, 1 - 1e-4),  # where what conducts badly is drawn above 1, it is cut: a kink
     st.floats(1, 220).filter(lambda p: np.abs(p - TABLE_KPA).min() > 0.1),
     log_ratios,
 )
