@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 import tomllib
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,7 @@ def run(fit: FieldFit) -> None:
     """Draw, evaluate and differentiate one scene after another, and step to fewer contacts."""
     rng, count = np.random.default_rng(1), len(fit.forward.bare_voltages)
     data = {
-        name: measured(rng.normal(size=count), 2.0).drifting(rng.normal(size=(count, 2)))
+        name: replace(measured(rng.normal(size=count), 2.0), drift=rng.normal(size=(count, 2)))
         for name in fit.responses
     }
     graded = fit.responses[Channel.MAGNITUDE]

@@ -95,7 +95,7 @@ class Fit:
         """The same, where the sheets may have drifted since the tare."""
         drift = self._skin.tare.sensor.drift
         changes = {
-            name: each.drifting(self._since_tare(name, each)[:, None] * drift)
+            name: replace(each, drift=self._since_tare(name, each)[:, None] * drift)
             for name, each in measurement.changes.items()
         }
         return replace(measurement, changes=changes)

@@ -135,10 +135,10 @@ class Search:
         """What is believed after one frame more."""
         if belief is None or belief.account.fitted.solutions.keys() != frame.measured.keys():
             return self._tried(self._cold(frame), frame)
-        frame = replace(frame, measured=belief.judged(frame.measured))
         still, since = self._is_still(belief, frame)
         if still:
-            return self._held(replace(belief, since=since, how="still"), frame)
+            judged = replace(frame, measured=belief.judged(frame.measured))
+            return self._held(replace(belief, since=since, how="still"), judged)
         frame = self._with_outline_errors(belief.account, frame)
         return self._tried(self._followed(belief, frame), frame)
 

@@ -82,14 +82,6 @@ class Changes:
             tolerance=error_ratio * self.tolerance,
         )
 
-    def drifting(self, directions: FloatArray) -> Changes:
-        """The same, where a drift of the sheet since the tare counts as an error.
-
-        Args:
-            directions: (M, K) changes of one standard deviation each.
-        """
-        return replace(self, drift=directions)
-
     @cached_property
     def nuisance(self) -> tuple[FloatArray, FloatArray] | None:
         """Orthonormal directions (M, K) of weighted changes that may be such errors.
