@@ -60,7 +60,7 @@ ORDER = {
         *("commissioning", "simulators"),
     ),
     "tactomo": (
-        *("errors", "plain", "journal", "log", "timing", "events", "endpoint", "scans", "worker"),
+        *("errors", "plain", "log", "timing", "events", "endpoint", "scans", "worker"),
         *("ending", "memory", "running"),
         *("protocols", "config", "recordings", "acquisition", "stream", "imaging"),
         *("service", "twin", "cli", "__main__"),

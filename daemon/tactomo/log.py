@@ -15,8 +15,7 @@ from typing import Any, Literal
 
 import structlog
 
-from tactomo.journal import is_journal, with_priority
-from tactomo.plain import plain
+from tactomo.plain import is_journal, plain, with_priority
 
 LogLevel = Literal["debug", "info", "warning", "error"]
 LogFormat = Literal["auto", "text", "json", "journal"]

@@ -146,7 +146,7 @@ def test_what_is_completed_is_what_there_is() -> None:
 
 def test_a_distribution_adds_commands(monkeypatch: pytest.MonkeyPatch) -> None:
     added = {
-        name: EntryPoint(name, "tactomo.cli.files.recover:app", commands.ENTRY_POINTS)
+        name: EntryPoint(name, "tactomo.cli.files.reconstruct:app", commands.ENTRY_POINTS)
         for name in ("mend", "models.mend")
     }
     monkeypatch.setattr(commands, "_entry_points", lambda: added)

@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 from fixture_types import Run
-from tactomo.acquisition import udev
 from tactomo.acquisition.adapters import Adapter
 from tactomo.config import load_config, load_skins
 from tactomo.errors import ServiceError
 from tactomo.service import installation
+from tactomo.service.installation import udev_rules
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"
@@ -157,7 +157,7 @@ def test_what_stands_in_the_way_is_said(tactomo: Run, monkeypatch: pytest.Monkey
 
 def test_an_adapter_is_known_by_its_serial_number() -> None:
     adapters = [adapter(0), adapter(1)]
-    text, names = udev.rules("palm", ["/dev/ttyUSB1"], adapters)
+    text, names = udev_rules("palm", ["/dev/ttyUSB1"], adapters)
     assert names == ("/dev/tactomo/palm",)
     tty, usb = text.splitlines()[1:]
     assert tty == (
@@ -170,7 +170,7 @@ def test_an_adapter_is_known_by_its_serial_number() -> None:
 @pytest.mark.parametrize("serial_number", ["", "0001", 'A"1', "A*"])
 def test_adapters_that_look_alike_are_known_by_their_sockets(serial_number: str) -> None:
     adapters = [adapter(number, serial_number=serial_number) for number in (1, 2)]
-    text, names = udev.rules("palm", [a.path for a in adapters], adapters)
+    text, names = udev_rules("palm", [a.path for a in adapters], adapters)
     assert names == ("/dev/tactomo/palm-0", "/dev/tactomo/palm-1")
     assert text.splitlines()[1:] == [
         f'SUBSYSTEM=="tty", ENV{{ID_PATH}}=="pci-0000:00:14.0-usb-0:{number}:1.0", '
@@ -181,9 +181,9 @@ def test_adapters_that_look_alike_are_known_by_their_sockets(serial_number: str)
 
 def test_a_port_with_a_lasting_name_or_none_keeps_its_name() -> None:
     by_id = adapter(0).names[0]
-    assert udev.rules("palm", [by_id, "/dev/ttyAMA0"], [adapter(0)])[0] == ""
+    assert udev_rules("palm", [by_id, "/dev/ttyAMA0"], [adapter(0)])[0] == ""
     with pytest.raises(ServiceError, match="no serial number"):
-        udev.rules("palm", ["/dev/ttyUSB0"], [adapter(0, serial_number="", names=())])
+        udev_rules("palm", ["/dev/ttyUSB0"], [adapter(0, serial_number="", names=())])
 
 
 @needs_systemd
@@ -215,7 +215,7 @@ def test_udev_understands_the_rules(tmp_path: Path) -> None:
     if "verify" not in help_text:
         pytest.skip("needs udevadm verify (systemd 254)")
     skin = tmp_path / "70-tactomo-palm.rules"
-    skin.write_text(udev.rules("palm", ["/dev/ttyUSB0"], [adapter(0)])[0])
+    skin.write_text(udev_rules("palm", ["/dev/ttyUSB0"], [adapter(0)])[0])
     for rules in (DEPLOY / "udev/71-tactomo.rules", skin):
         subprocess.run(["udevadm", "verify", str(rules)], check=True)
 

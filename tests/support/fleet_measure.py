@@ -28,7 +28,7 @@ from typing import Any
 
 import msgpack  # type: ignore[import-untyped]
 import zenoh
-from tactomo.stream import zenoh_publication
+from tactomo.stream import zenoh_bridge
 from tactomo_client import Contact
 from tactomo_client.messages import clock_id, encode_message
 
@@ -49,7 +49,7 @@ class Case:
     touched: int = 0
     seconds: float = 15.0
     robots: int = 4
-    heartbeat_s: float = zenoh_publication.HEARTBEAT_S
+    heartbeat_s: float = zenoh_bridge.HEARTBEAT_S
     kills_router: bool = False
     knows_both: bool = False
     """Whether robots may connect to the second router, too."""
@@ -91,9 +91,9 @@ def touch() -> list[Contact]:
 
 def robot(ports: list[int], number: int, case: Case, start_s: float) -> None:
     """Publish a robot's skins, print how many messages were sent, and stay until killed."""
-    zenoh_publication.HEARTBEAT_S = case.heartbeat_s  # type: ignore[misc]
+    zenoh_bridge.HEARTBEAT_S = case.heartbeat_s  # type: ignore[misc]
     with session("client", 0, *ports) as own:
-        publication = zenoh_publication.Publication(own, f"robot{number}")
+        publication = zenoh_bridge.Publication(own, f"robot{number}")
         names = [f"skin{n}" for n in range(case.skins // case.robots)]
         is_touched = {name: n < case.touched // case.robots for n, name in enumerate(names)}
         at_rest = {name: frame(name, 1, []) for name in names}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tactomo.twin.converter import Converter
+from tactomo.twin.firmware import Converter
 from tactomo_models.arrays import FloatArray
 from tactomo_protocol import Channel
 

@@ -6,11 +6,13 @@ there has a `trace`, which it keeps for as long as it is followed (`tactomo_clie
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, Final
+from collections.abc import Callable, Iterable, Mapping
+from typing import IO, Any, Final
 
 import foxglove
 from foxglove import channels
+from foxglove.channels import FrameTransformsChannel
+from foxglove.mcap import MCAPWriteOptions
 from tactomo_client import Contact, Frame
 from tactomo_client.schema import wire_fields
 from tactomo_client.touch import Traces
@@ -158,3 +160,32 @@ def _frame_numbers(frame: Frame, last: Frame | None, age_s: float | None) -> dic
             "pressure_max_kpa": max(pressures, default=None if frame.contacts else 0.0),
         }.items()
     )
+
+
+PROFILE = "tactomo-foxglove"
+
+
+def write_mcap(
+    # in the order of their times: when each was acquired, nanoseconds since 1970; the frame; and
+    # how old it was when it was published, seconds, if that is known
+    frames: Iterable[tuple[int, Frame, float | None]],
+    file: IO[bytes],  # a file opened for writing, which stays open
+    sensor: str,  # the sensor's name
+    description: Mapping[str, Any],  # the sensor, as `status` has it; empty where it is not known
+) -> int:
+    """Write frames as an MCAP file, one at a time; return how many. Raises OSError as files do."""
+    context = foxglove.Context()
+    transforms = FrameTransformsChannel("/tf", context=context)
+    topics = SensorTopics(sensor, context, transforms)
+    options = MCAPWriteOptions(profile=PROFILE, compression_threads=0)
+    count = 0
+    writer = foxglove.open_mcap(file, context=context, writer_options=options)
+    for count, (time_ns, frame, age_s) in enumerate(frames, 1):
+        if count == 1 and description:
+            topics.sheet(description, time_ns)
+        topics.frame(frame, time_ns, age_s)
+    try:
+        writer.close()
+    except RuntimeError as error:  # so it says that an earlier write had failed
+        raise OSError(f"the file could not be written: {error}") from error
+    return count

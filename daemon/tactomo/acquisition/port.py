@@ -31,11 +31,10 @@ from tactomo_protocol import (
 )
 
 from tactomo.acquisition.companion_log import CompanionLog
-from tactomo.acquisition.connection import Connection
+from tactomo.acquisition.connection import Connection, ReplaySource
 from tactomo.acquisition.device_clock import MAX_RATE, ClockState, DeviceClock
 from tactomo.acquisition.liveness import DeviceState, Liveness
 from tactomo.acquisition.open_serial import other_holders
-from tactomo.acquisition.replay_source import ReplaySource
 from tactomo.events import OnEvent, Rises, times
 from tactomo.protocols import PortProtocol, Trouble
 from tactomo.recordings.active_recording import ActiveRecording

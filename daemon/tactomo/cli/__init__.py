@@ -12,8 +12,8 @@ import sys
 import traceback
 
 from tactomo.cli.commands import app
-from tactomo.cli.failure import explain
-from tactomo.cli.parent_watch import watch_parent
+from tactomo.ending import watch_parent
+from tactomo.errors import explain
 from tactomo.plain import plain
 
 __all__ = ["app", "main"]
@@ -46,7 +46,7 @@ def _flush() -> None:
 
 def _print_error(what: Exception | str) -> None:
     """Print an error, or the traceback of a mistake of ours; as an error, where journald reads."""
-    from tactomo.journal import is_journal, with_priority
+    from tactomo.plain import is_journal, with_priority
 
     text = (
         plain(what) if isinstance(what, str) else "".join(traceback.format_exception(what)).rstrip()

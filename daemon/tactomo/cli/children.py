@@ -19,8 +19,7 @@ import time
 from collections.abc import Mapping
 from typing import Any, Self
 
-from tactomo.cli.parent_watch import VARIABLE
-from tactomo.ending import AS_WELL, ASKED, at_end
+from tactomo.ending import AS_WELL, ASKED, VARIABLE, at_end
 from tactomo.errors import TactomoError
 
 VIEWER_SAYS = "viewer: "

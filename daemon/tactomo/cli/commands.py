@@ -20,14 +20,14 @@ import math
 import os
 from collections.abc import Iterator, Mapping
 from importlib import import_module
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
-from tactomo.cli.laboratory import not_installed
 from tactomo.cli.output import say
+from tactomo.errors import TactomoError
 
 ENTRY_POINTS = "tactomo.commands"
 OTHERS = "Of other distributions"
@@ -50,10 +50,10 @@ COMMANDS = {
         (RUN, "demo", "Start a simulated skin to press in the browser.", "run.demo"),
         (RUN, "daemon", "Read a skin's ports and publish maps and contacts.", "run.daemon"),
         (RUN, "ports", "List serial adapters and their problems.", "run.ports"),
-        (RUN, "zenoh", "Carry streams beyond this computer by Zenoh.", "run.zenoh"),
+        (RUN, "zenoh", "Carry streams beyond this computer by Zenoh.", "run.serve"),
         (RUN, "twin", "Simulate a skin behind simulated firmware.", "run.twin"),
-        (RUN, "viewer", "Serve a web page with a daemon's maps and contacts.", "run.viewer"),
-        (RUN, "foxglove", "Serve maps, contacts and events to Foxglove.", "run.foxglove"),
+        (RUN, "viewer", "Serve a web page with a daemon's maps and contacts.", "run.serve"),
+        (RUN, "foxglove", "Serve maps, contacts and events to Foxglove.", "run.serve"),
         (STEER, "status", "Show the daemon's state, problems first.", "steer.status"),
         (STEER, "doctor", "Examine a skin at rest, with next steps.", "doctor.doctor"),
         (STEER, "watch", "Show map, contacts and health in the terminal.", "steer.watch"),
@@ -64,10 +64,10 @@ COMMANDS = {
         (STEER, "method", "Choose the reconstruction method.", "steer.steer"),
         (STEER, "poke", "Press, release and break a running twin.", "steer.steer"),
         (STEER, "keys", "Manage keys of clients on other computers.", "steer.keys"),
-        (FILES, "info", "Describe a recording, a folder or a sensor.", "files.info"),
-        (FILES, "import", "Turn measured scans into a recording.", "files.import_scans"),
+        (FILES, "info", "Describe a recording, a folder or a sensor.", "files.recording"),
+        (FILES, "import", "Turn measured scans into a recording.", "files.recording"),
         (FILES, "replay", "Play a recording through the daemon.", "run.daemon"),
-        (FILES, "recover", "Repair a cut or damaged recording.", "files.recover"),
+        (FILES, "recover", "Repair a cut or damaged recording.", "files.recording"),
         (FILES, "reconstruct", "Reconstruct a file of scans.", "files.reconstruct"),
         (FILES, "plot", "Draw a recording on one page.", "plot.plot"),
         (FILES, "export", "Write a recording's frames for other programs.", "files.export"),
@@ -242,3 +242,23 @@ def _start(
     if context.invoked_subcommand is None:
         say(context.get_help())
         raise typer.Exit(2)
+
+
+BENCH: Final = "tactomo.bench"  # entry points: functions that measure for `tactomo bench`
+
+
+def not_installed(what: str) -> TactomoError:
+    """Return the error that says where to get what only the laboratory has."""
+    return TactomoError(
+        f"{what} is part of the laboratory, which is not installed",
+        "pip install tactomo-lab, or `make setup` in a checkout",
+    )
+
+
+def measurement(name: str) -> Any:
+    """Return the laboratory's function of this name for `tactomo bench`, or raise TactomoError."""
+    from importlib.metadata import entry_points
+
+    for entry in entry_points(group=BENCH, name=name):
+        return entry.load()
+    raise not_installed(f"bench --{name}")

@@ -36,8 +36,7 @@ from tactomo.imaging.companions import Companions
 from tactomo.imaging.frame_marks import FrameMarks, InForce
 from tactomo.imaging.frozen_converter import FrozenConverters
 from tactomo.imaging.kept_reference import KeptReference, KnownSkin
-from tactomo.imaging.method_in_force import Effort, MethodInForce
-from tactomo.imaging.processor_share import ProcessorShare
+from tactomo.imaging.method_in_force import Effort, MethodInForce, ProcessorShare
 from tactomo.imaging.tare import Taring
 from tactomo.plain import counted
 from tactomo.recordings.recorder import Recorder

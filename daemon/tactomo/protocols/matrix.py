@@ -41,7 +41,7 @@ class Matrix(LineProtocol):
 
     name = "matrix"
     device_id = "matrix"
-    emulator = "tactomo.twin.boards:MatrixBoard"
+    emulator = "tactomo.twin.foreign:MatrixBoard"
     patience_s = 10.0  # a frame of 32 electrodes takes seconds, and a key may begin it anew
 
     def __init__(self, description: SensorDescription) -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -23,6 +24,7 @@ from typing import Final, Literal
 
 from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM
 
+from tactomo.acquisition.adapters import Adapter, look_alikes
 from tactomo.endpoint import next_address
 from tactomo.errors import ServiceError, os_errors_as
 
@@ -104,7 +106,7 @@ class Plan:
 def plan_install(
     name: str,  # of the skin, and of the service's instance
     ports: Sequence[str],  # as the daemon is to open them
-    rules: str,  # for udev, see `tactomo.acquisition.udev.rules`; may be empty
+    rules: str,  # for udev, see `udev_rules`; may be empty
     root: Path,  # ``/``, or where an image's disk is mounted
     program: str,  # `tactomo` as the service is to call it
 ) -> Plan:
@@ -275,3 +277,77 @@ def _read(path: Path) -> str | None:
         return path.read_text("utf-8")
     except FileNotFoundError:
         return None
+
+
+BY_PATH: Final = "/dev/serial/by-path/"
+RULES_HEADER: Final = (
+    "# Serial ports of the skin {name}. What is done with them: 71-tactomo.rules.\n"
+)
+# Others could mean something in a rule: quotes, wildcards, substitutions.
+_PLAIN: Final = re.compile(r"[\w.:+-]+")
+
+
+def udev_rules(
+    name: str, ports: Sequence[str], adapters: list[Adapter]
+) -> tuple[str, tuple[str, ...]]:
+    """Return udev's rules of a skin, and the names under which its ports are to be opened.
+
+    An adapter is known by its maker, product and serial number. Cheap ones have no serial number,
+    or all the same; those are known by the USB socket that they are plugged into, as udev's names
+    by path are. What happens to a port so marked stands in ``deploy/udev/71-tactomo.rules``.
+
+    A port that has a lasting name already, or none to be known by, keeps the name that it has.
+    """
+    lines, names = [], []
+    for index, port in enumerate(ports):
+        adapter = _adapter_at(port, adapters)
+        if adapter is None or not adapter.is_usb or port.startswith("/dev/serial/"):
+            names.append(port)
+            continue
+        mark = name if len(ports) == 1 else f"{name}-{index}"
+        lines += _rule(mark, adapter, adapters)
+        names.append(f"/dev/tactomo/{mark}")
+    text = RULES_HEADER.format(name=name) + "".join(f"{line}\n" for line in lines) if lines else ""
+    return text, tuple(names)
+
+
+def _adapter_at(port: str, adapters: list[Adapter]) -> Adapter | None:
+    """Return the adapter that is behind a path; None if none of them is."""
+    path = os.path.realpath(port)
+    return next((adapter for adapter in adapters if adapter.path in (port, path)), None)
+
+
+def _rule(mark: str, adapter: Adapter, adapters: list[Adapter]) -> list[str]:
+    """Return the lines that mark a USB adapter; raise ServiceError where nothing identifies it."""
+    is_told_apart = not look_alikes(adapter, adapters)
+    if _PLAIN.fullmatch(adapter.serial_number) and is_told_apart:
+        return _by_serial_number(mark, adapter)
+    return [_by_socket(mark, adapter)]
+
+
+def _by_serial_number(mark: str, adapter: Adapter) -> list[str]:
+    device = {
+        "idVendor": f"{adapter.vendor_id:04x}",
+        "idProduct": f"{adapter.product_id:04x}",
+        "serial": adapter.serial_number,
+    }
+    port = "".join(f'ATTRS{{{key}}}=="{value}", ' for key, value in device.items())
+    whole = port.replace("ATTRS", "ATTR")
+    number = adapter.interface
+    only = "" if number is None else f'ENV{{ID_USB_INTERFACE_NUM}}=="{number:02x}", '
+    return [
+        f'SUBSYSTEM=="tty", {port}{only}ENV{{TACTOMO}}="{mark}"',
+        f'SUBSYSTEM=="usb", ENV{{DEVTYPE}}=="usb_device", {whole}ENV{{TACTOMO}}="{mark}"',
+    ]
+
+
+def _by_socket(mark: str, adapter: Adapter) -> str:
+    paths = [path for path in adapter.names if path.startswith(BY_PATH)]
+    if not paths:
+        raise ServiceError(
+            f"{adapter.path} has no serial number of its own, and udev gave it no name by path",
+            "check that udev runs, or give a path that lasts yourself",
+        )
+    path, _, port = paths[0].removeprefix(BY_PATH).partition("-port")
+    only = f'ENV{{.ID_PORT}}=="{port}", ' if port else ""
+    return f'SUBSYSTEM=="tty", ENV{{ID_PATH}}=="{path}", {only}ENV{{TACTOMO}}="{mark}"'

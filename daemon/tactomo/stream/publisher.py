@@ -22,7 +22,7 @@ from tactomo_client.schema import Envelope, wire_fields
 
 from tactomo.events import OnEvent
 from tactomo.stream.access_control import STREAM
-from tactomo.stream.subscriptions import SUBSCRIBERS_CUT, Subscribers
+from tactomo.stream.peers import SUBSCRIBERS_CUT, Subscribers
 from tactomo.timing import Durations
 from tactomo.worker import Bell, Worker
 

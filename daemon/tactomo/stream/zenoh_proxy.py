@@ -19,10 +19,17 @@ from tactomo_client.schema import EVENTS
 
 from tactomo.events import RateLimit
 from tactomo.stream.access_control import STREAM, Context
-from tactomo.stream.relay import LOOK_S, POLL_MS, QUEUED, Relay, tell, waiting
-from tactomo.stream.subscriptions import SUBSCRIBERS_CUT, Subscribers
-from tactomo.stream.zenoh_bridge import open_session
-from tactomo.stream.zenoh_publication import MAX_SENSORS
+from tactomo.stream.peers import SUBSCRIBERS_CUT, Subscribers
+from tactomo.stream.zenoh_bridge import (
+    LOOK_S,
+    MAX_SENSORS,
+    POLL_MS,
+    QUEUED,
+    Relay,
+    open_session,
+    tell,
+    waiting,
+)
 
 LINGER_MS: Final = 200
 MAX_KEYS: Final = 256

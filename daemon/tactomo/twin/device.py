@@ -48,8 +48,7 @@ from tactomo.twin.control import (
     PressArguments,
     ReleaseArguments,
 )
-from tactomo.twin.converter import Converter
-from tactomo.twin.firmware import RATE_HZ_MAX, RATE_HZ_MIN, Firmware, Port, Voltages
+from tactomo.twin.firmware import RATE_HZ_MAX, RATE_HZ_MIN, Converter, Firmware, Port, Voltages
 from tactomo.twin.foreign import Emulator, ForeignFirmware
 from tactomo.twin.line import SerialLine
 from tactomo.twin.scene import Indenter, Scene, SkinDriftSettings

@@ -17,6 +17,8 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+from numpy.typing import NDArray
 from tactomo_models.arrays import FloatArray
 from tactomo_protocol import (
     Acknowledge,
@@ -32,8 +34,35 @@ from tactomo_protocol import (
     encode,
 )
 
-from tactomo.twin.converter import Converter
 from tactomo.twin.line import SerialLine
+
+ADC_BITS = 24
+
+
+@dataclass
+class Converter:
+    """Turns volts into counts. `noise_v` may be changed between scans."""
+
+    full_scale_v: float  # volts at the end of the converter's range, either sign
+    noise_v: float  # standard deviation of the noise in volts, the same on every measurement
+    seed: int = 0  # equal seeds give equal noise
+
+    @property
+    def volts_per_count(self) -> float:
+        """Size of one count, in volts."""
+        return float(self.full_scale_v / 2 ** (ADC_BITS - 1))
+
+    def convert(
+        self, volts: FloatArray, *, channel: Channel, counter: int
+    ) -> tuple[NDArray[np.int32], bool]:
+        """Return the counts of one scan, (M,), and whether any of them hit the end of the range."""
+        noise = np.random.default_rng([self.seed, channel.number, counter, 1])
+        seen_v = volts + self.noise_v * noise.standard_normal(len(volts))
+        top = 2 ** (ADC_BITS - 1) - 1
+        counts = np.rint(seen_v / self.volts_per_count)
+        saturated = bool(np.any(np.abs(counts) > top))
+        return np.clip(counts, -top, top).astype(np.int32), saturated
+
 
 HELLO_PERIOD_S = 1.0
 RATE_HZ_MIN, RATE_HZ_MAX = 0.1, 500.0

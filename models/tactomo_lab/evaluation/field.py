@@ -28,9 +28,15 @@ from tactomo_lab.evaluation.moving import (
 )
 from tactomo_lab.evaluation.play import Outcome, play
 from tactomo_lab.evaluation.regimes import REGIMES, make_case
-from tactomo_lab.scenes.case import Case, with_companion
+from tactomo_lab.scenes.case import (
+    SCENE_SHAPES,
+    Case,
+    SceneShape,
+    draw_still,
+    still_case,
+    with_companion,
+)
 from tactomo_lab.scenes.drawing import SeedSet
-from tactomo_lab.scenes.still_scenes import SCENE_SHAPES, SceneShape, draw_still, still_case
 
 MAX_CONTACTS = 4  # of a scene that is not crowded
 ORDINARY_DB = (40.0, 20.0, 10.0)  # of the change, as the paper tests

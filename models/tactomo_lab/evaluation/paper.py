@@ -39,12 +39,12 @@ from tactomo_lab.scenes.case import (
     as_described,
     noise_stds,
     simulate,
+    still_case,
 )
 from tactomo_lab.scenes.drawing import SeedSet, require_channels, seed_of
 from tactomo_lab.scenes.measures import Summary, full_range, summarise_by
 from tactomo_lab.scenes.presets import PAPER_CONTACTS, PAPER_CONTRAST, paper_presses
 from tactomo_lab.scenes.simulation import Volts
-from tactomo_lab.scenes.still_scenes import still_case
 
 # The paper's three, then ours.
 DEFAULT_METHODS: Final = ("tikhonov", "cnn-single", "cnn-multimodal", "network", "auto")

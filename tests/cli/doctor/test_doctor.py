@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 from fixture_types import Run
 from shared_data import measured
-from tactomo.cli.doctor.evidence import evidence_of_messages
-from tactomo.cli.doctor.stream_findings import stream_findings
+from tactomo.cli.doctor.evidence import evidence_of_messages, stream_findings
 from tactomo.cli.sensors import of_this_version
 from tactomo.errors import TactomoError
 from tactomo.recordings.recording_writer import write_recording

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tactomo.imaging.processor_share import HOLD_S, LEAST, ProcessorShare
+from tactomo.imaging.method_in_force import HOLD_S, LEAST, ProcessorShare
 
 FRAME_S = 0.05
 

@@ -46,7 +46,7 @@ from tactomo_models.calibration.calibration_file import (
     subject_of,
 )
 from tactomo_models.calibration.curve import Reading
-from tactomo_viewer.feed import Feed
+from tactomo_viewer.browser import Feed
 from waiting import PATIENCE_S, wait_until
 
 SERVER = "left"

@@ -26,7 +26,7 @@ from hostile_page import SUBSCRIBE, post
 from needs import need
 from page import Page
 from tactomo.stream import zenoh_bridge
-from tactomo.stream.zenoh_publication import ENCODING, HEARTBEAT_S, STATUS_HEARTBEAT_S
+from tactomo.stream.zenoh_bridge import ENCODING, HEARTBEAT_S, STATUS_HEARTBEAT_S
 from tactomo_client import Contact, request, subscribe
 from tactomo_client.fake import FakeSensor
 from tactomo_client.messages import decode_message, topic

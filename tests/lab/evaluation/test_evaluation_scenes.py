@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tactomo_lab.scenes.case import Case, SnrOf, measure, simulate
+from tactomo_lab.scenes.case import Case, SnrOf, draw_still, measure, simulate
 from tactomo_lab.scenes.drawing import (
     BOTH_CHANNELS,
     GAP_M,
@@ -27,7 +27,6 @@ from tactomo_lab.scenes.simulation import (
     with_contrast,
     with_opposite_magnitude,
 )
-from tactomo_lab.scenes.still_scenes import draw_still
 from tactomo_models import DataError, Press, SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.mesh import SheetMesh, mesh_sheet

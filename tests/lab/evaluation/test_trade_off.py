@@ -16,8 +16,8 @@ from tactomo_lab.evaluation.trade_off import (
     points_of,
     variants,
 )
+from tactomo_lab.scenes.case import draw_still, still_case
 from tactomo_lab.scenes.measures import summarise
-from tactomo_lab.scenes.still_scenes import draw_still, still_case
 from tactomo_models import SensorDescription, available_methods
 from tactomo_models.methods.registry import BUDGETED
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tactomo_lab.scenes.case import draw_still
 from tactomo_lab.scenes.presets import TrainingScene, draw_scene
 from tactomo_lab.scenes.simulation import UnevenSheet, UnevenSkin, displaced, fine_mesh
-from tactomo_lab.scenes.still_scenes import draw_still
 from tactomo_lab.training.training_scenes import SceneSimulator
 from tactomo_models import Press, SensorDescription
 from tactomo_models.arrays import FloatArray

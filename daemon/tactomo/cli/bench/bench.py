@@ -3,7 +3,7 @@
 *Live*: a twin and a daemon as processes of their own, and this process as the subscriber; latency
 is from the moment at which the daemon has read the last byte of a dual scan to the arrival of its
 contacts here, by the clock that both processes share. *Chart* is the laboratory's, see
-`tactomo.cli.laboratory`.
+`tactomo.cli.commands`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli import options
-from tactomo.cli.laboratory import measurement
+from tactomo.cli.commands import measurement
 from tactomo.cli.output import print_json, table
 
 if TYPE_CHECKING:

@@ -101,8 +101,7 @@ def doctor(
     from tactomo_models.health.findings import worst
 
     from tactomo.cli.console import Console
-    from tactomo.cli.doctor.evidence import of_daemon
-    from tactomo.cli.doctor.stream_findings import stream_findings
+    from tactomo.cli.doctor.evidence import of_daemon, stream_findings
 
     with Console(stderr=True).status("examining") as line_shown:
         if what is None:

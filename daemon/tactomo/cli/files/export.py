@@ -28,7 +28,7 @@ from tactomo.cli.options import (
 )
 from tactomo.cli.output import say
 from tactomo.cli.plot.plot import prepare_file
-from tactomo.cli.run.foxglove import write_layout
+from tactomo.cli.run.serve import write_layout
 from tactomo.errors import TactomoError, needs, os_errors_as
 
 if TYPE_CHECKING:
@@ -182,8 +182,7 @@ def _about(frames: RecordedFrames) -> dict[str, Any]:
 def _dataset_writer(
     robot: Path | None, fps: int | None, task: str, gaps: Gaps, told: list[str]
 ) -> Writer:
-    from tactomo.cli.files.lerobot import need_lerobot, write_dataset
-    from tactomo.cli.files.robot_log import read_robot_log
+    from tactomo.cli.files.lerobot import need_lerobot, read_robot_log, write_dataset
 
     log = None if robot is None else read_robot_log(robot)
     need_lerobot()

@@ -26,10 +26,9 @@ import structlog
 from tactomo_models import load_description
 from tactomo_models.methods.trained_networks import SensorNetworks
 
-from tactomo.cli.failure import explain
-from tactomo.cli.parent_watch import stop_at_end_of
 from tactomo.config import DaemonConfig
-from tactomo.ending import AS_WELL, ASKED, at_end
+from tactomo.ending import AS_WELL, ASKED, at_end, stop_at_end_of
+from tactomo.errors import explain
 from tactomo.log import configure_logging
 from tactomo.service.daemon import Daemon, load_model
 from tactomo.service.supervision import STATUS_PERIOD_S, notify

@@ -60,12 +60,11 @@ def install(
     """
     from tactomo_client.messages import check_sensor_name
 
-    from tactomo.acquisition import udev
     from tactomo.acquisition.adapters import list_adapters
-    from tactomo.service.installation import plan_install
+    from tactomo.service.installation import plan_install, udev_rules
 
     check_sensor_name(name, "skin")
-    rules, names = udev.rules(name, port, list_adapters())
+    rules, names = udev_rules(name, port, list_adapters())
     for unnamed in set(port).intersection(names):
         if not unnamed.startswith(("/dev/serial/", "/dev/tactomo/")):
             say(f"No USB adapter is at {unnamed}: the service keeps this name.\n", err=True)
