@@ -40,6 +40,9 @@ setup: $(READY) ## the environment in .venv, which the others make by themselves
 run: $(RUN_READY)  ## twin, daemon and viewer: a skin to press in the browser
 	$(BIN)/tactomo demo $(ARGS)
 
+# The tests start many a Python, each of which compiles all that it imports where none keeps it.
+test test-lab test-all test-random test-long test-train faults: export PYTHONDONTWRITEBYTECODE :=
+
 test: $(READY)   ## the default test suite
 	$(BIN)/pytest -n auto --dist loadfile $(ARGS)
 
