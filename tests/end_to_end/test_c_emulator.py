@@ -144,7 +144,8 @@ def rigs() -> Iterator[list[Rig]]:
         rig.daemon.kill()
 
 
-@pytest.mark.parametrize("ports", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.slow
+@pytest.mark.parametrize("ports", [1, 2])
 def test_a_press_on_the_emulator_is_found_where_it_was(
     rigs: list[Rig], program: Path, presses: tuple[Path, Path], tmp_path: Path, ports: int
 ) -> None:

@@ -102,6 +102,7 @@ def test_the_readme_subscribes_in_six_lines(demo: Demo, tmp_path: Path) -> None:
     assert "kPa" in line
 
 
+@pytest.mark.slow
 def test_doctor_finds_a_healthy_skin_and_noise(tactomo: Run, demo: Demo) -> None:
     def snrs(status: int) -> list[dict[str, Any]]:
         look = ("doctor", "-s", SENSOR, "--address", demo.stream, "--seconds", "1", "--json")

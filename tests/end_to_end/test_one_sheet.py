@@ -151,6 +151,7 @@ def test_status_and_doctor_know_of_one_sheet(one_sheet: tuple[Demo, str]) -> Non
     demo.press(*AT_MM, **PRESS)
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_the_page_shows_the_contact(one_sheet: tuple[Demo, str], browser: Chrome) -> None:
     demo, _ = one_sheet

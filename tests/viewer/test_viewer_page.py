@@ -349,6 +349,7 @@ NUMBER_AT = """
 SEEN = "return tactomo.surface.mmToPixel(arguments[0], arguments[1])"
 
 
+@pytest.mark.slow
 def test_a_mounted_sheet_is_pressed_and_turned_on_its_surface(page: Page) -> None:
     page.skin.status = page.skin.status | {"description": {**DESCRIPTION, "mount": around(0.04)}}
     page.skin.press(-15, 20)
@@ -1200,6 +1201,7 @@ def test_what_stops_is_told_and_comes_back(page: Page) -> None:
         wait_until(page["tare"].is_enabled)
 
 
+@pytest.mark.slow
 def test_a_server_given_up_for_its_silence_is_asked_again_once(page: Page) -> None:
     page.open()
     # The socket that is given up closes a little later, while the next one is waited for.
@@ -1255,6 +1257,7 @@ def test_a_daemon_that_never_came_is_waited_for(page: Page) -> None:
 # For everybody
 
 
+@pytest.mark.slow
 def test_at_every_width_all_is_seen_and_nothing_moves_when_a_banner_comes(page: Page) -> None:
     page.skin.press(60, 60, kpa=280.0)
     (contact,) = page.skin.contacts
@@ -1316,6 +1319,7 @@ const isMarked = outlineStyle !== 'none' && parseFloat(outlineWidth) >= 2;
 return [at.id || at.name || at.closest('table, ol')?.id, isMarked]"""
 
 
+@pytest.mark.slow
 def test_whoever_sees_nothing_or_has_no_mouse_is_served(page: Page) -> None:
     def nodes() -> list[dict[str, Any]]:
         every = page.browser.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]

@@ -43,6 +43,7 @@ def errors_mm(tactomo: Run, folder: Path, *options: Any) -> tuple[np.ndarray, di
     return np.linalg.norm(places - new["xy_mm"][maps["contact_frame"]], axis=1), maps
 
 
+@pytest.mark.slow
 def test_a_taught_skin_is_located_better(tactomo: Run, tmp_path: Path) -> None:
     made = teach(tactomo, tmp_path, presses(30, seed=1))
     assert "palm: 30 presses of" in made.stdout

@@ -18,11 +18,10 @@ from hostile_files import CORPUS
 from tactomo_models import SkinSimulator, load_description
 
 QUICK: Final = {
-    "info": ("boastful.npz", "crowd.eit", "markup.mcap", "kernel.mcap", "marks.mcap", "pipe.csv"),
-    "plot": ("timeless.mcap",),
+    "info": ("boastful.npz", "marks.mcap"),
     "model": ("beyond.svg",),
     "replay": ("piped.mcap",),
-    "reconstruct": ("pipe.npz", "beyond.npz", "beyond.csv", "zeros.csv"),
+    "reconstruct": ("pipe.npz",),
 }
 
 

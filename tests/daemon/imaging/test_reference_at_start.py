@@ -173,6 +173,7 @@ def test_boards_of_another_skin_are_named_at_the_start(
     assert "exchange" in told["next_step"]
 
 
+@pytest.mark.slow
 def test_a_twin_by_another_description_of_the_same_sheet_is_no_exchanged_cable(
     bench: Start,
 ) -> None:

@@ -29,6 +29,7 @@ def a_calibration(name: str, sensor: SensorDescription) -> PressureCalibration:
     return PressureCalibration.of_readings(subject_of(name, sensor), readings)
 
 
+@pytest.mark.slow
 def test_the_replay_of_a_pressed_skin_gives_the_same_maps(
     bench: Start, replay: Start, tmp_path: Path
 ) -> None:

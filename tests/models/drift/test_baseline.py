@@ -122,7 +122,8 @@ def test_a_contact_of_an_hour_stays_while_the_sheet_cools_and_leaves_no_ghost(li
     assert set(count(life.lives(20))) == {0}
 
 
-@pytest.mark.parametrize("kpa", [1.5, pytest.param(180.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kpa", [1.5, 180.0])
 def test_a_contact_that_lasts_is_never_erased(life: Life, kpa: float) -> None:
     frames = life.lives(12 * 3600, replace(PRESS, pressure_kpa=kpa), step_s=600.0)
     assert 0 not in count(frames)
@@ -245,9 +246,10 @@ def test_a_skin_with_a_lead_broken_for_good_is_followed_like_any(broken: Life) -
     assert np.abs(broken.tracker.reference.structure_drift).max() < 0.1  # also of that lead's
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "press",
-    [pytest.param(PRESS, marks=pytest.mark.slow), BESIDE_LEAD],
+    [PRESS, BESIDE_LEAD],
     ids=["firm", "light, beside it"],
 )
 def test_a_contact_that_lasts_is_never_erased_where_a_lead_is_broken(

@@ -192,6 +192,7 @@ def test_sheets_that_have_drifted_since_the_tare_hide_no_contact_and_make_none(
         method.reset()
 
 
+@pytest.mark.slow
 def test_a_drift_is_believed_until_the_scene_is_new(
     methods: dict[str, Reconstructor], skin: Skin, simulator: SkinSimulator
 ) -> None:
@@ -215,6 +216,7 @@ def test_a_drift_is_believed_until_the_scene_is_new(
     assert len(frame.contacts) == 2
 
 
+@pytest.mark.slow
 def test_a_drift_that_was_learnt_outlives_the_touch(
     methods: dict[str, Reconstructor], skin: Skin, simulator: SkinSimulator
 ) -> None:

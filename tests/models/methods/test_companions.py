@@ -105,7 +105,7 @@ def test_a_load_cell_that_contradicts_the_sheet_is_named_and_left_out(
     assert not again.flags & Flag.COMPANION_DISPUTED  # it is believed once it agrees
 
 
-@pytest.mark.parametrize("factor", [0.5, 2.0])
+@pytest.mark.parametrize("factor", [pytest.param(0.5, marks=pytest.mark.slow), 2.0])
 def test_a_load_cell_that_is_wrong_costs_a_moving_scene_nothing(
     sensor: SensorDescription, skin: Skin, monkeypatch: pytest.MonkeyPatch, factor: float
 ) -> None:

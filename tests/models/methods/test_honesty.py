@@ -55,7 +55,9 @@ def mirrored(volts: FloatArray, around: FloatArray | None) -> FloatArray:
     return 2 * around - volts
 
 
-@pytest.mark.parametrize("channel", Channel)
+@pytest.mark.parametrize(
+    "channel", [Channel.MAGNITUDE, pytest.param(Channel.STRUCTURE, marks=pytest.mark.slow)]
+)
 def test_a_sheet_against_the_sensors_sign_is_flagged(
     reconstructor: Reconstructor, skin: Skin, rest: Reference, channel: Channel
 ) -> None:
@@ -101,7 +103,7 @@ def response_to(change_at_200_kpa: float) -> dict[str, tuple[float, ...]]:
     }
 
 
-@pytest.mark.parametrize("structure", ["at rest", "missing"])
+@pytest.mark.parametrize("structure", ["at rest", pytest.param("missing", marks=pytest.mark.slow)])
 def test_a_magnitude_that_no_contact_explains_is_flagged(
     reconstructor: Reconstructor, skin: Skin, rest: Reference, structure: str
 ) -> None:

@@ -99,6 +99,7 @@ def kinds_by_x(belief: Belief) -> list[Kind]:
 # From frame to frame
 
 
+@pytest.mark.slow
 def test_an_outline_that_the_mesh_has_bent_is_seldom_surely_another(
     large: Sensor, paper: SensorDescription
 ) -> None:

@@ -59,6 +59,7 @@ def test_a_hand_made_sheet_is_found_by_its_reference(
     assert off(voltages, found) < 0.005
 
 
+@pytest.mark.slow
 def test_voltages_that_are_all_noise_do_not_keep_a_sheet_from_being_found() -> None:
     """On a long sheet most voltages are far from their drive: noise gives them their signs."""
     insole = load_description("insole")
@@ -188,7 +189,8 @@ def at_tare(far_from_even: SkinSimulator, pressed: bool) -> dict[Channel, FloatA
     return far_from_even.voltages([Press(0.03, -0.02, 200.0, 0.012)] if pressed else [])
 
 
-@pytest.mark.parametrize("method", ["tikhonov", pytest.param("fit", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["tikhonov", "fit"])
 def test_a_skin_far_from_even_is_no_other_sensor_but_one_that_is_pressed_is_flagged(
     paper: SensorDescription,
     artifact: Artifact,
@@ -205,6 +207,7 @@ def test_a_skin_far_from_even_is_no_other_sensor_but_one_that_is_pressed_is_flag
     assert (Flag.REFERENCE_MISMATCH in flags) == pressed
 
 
+@pytest.mark.slow
 def test_the_doctor_knows_a_skin_made_by_hand(
     paper: SensorDescription,
     artifact: Artifact,

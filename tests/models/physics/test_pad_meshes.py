@@ -98,6 +98,7 @@ def test_a_pad_that_is_moved_with_its_mesh_is_the_pad_described_there(number: in
     assert left < 0.15 * np.linalg.norm((wanted / at_rest)[counts])
 
 
+@pytest.mark.slow
 def test_a_tare_finds_pads_that_are_off_their_places() -> None:
     """Current that left a moved pad looked like no sheet at all: each skin was taken as even."""
     sensor = sheet_of_pads("rectangle", GRID)

@@ -119,7 +119,7 @@ def test_a_model_keeps_its_metric_in_a_file(ball: SensorDescription, tmp_path: P
     assert energy == pytest.approx(25 * ball.width_m * ball.height_m, rel=0.01)
 
 
-@pytest.mark.parametrize("lift", [along(1.3, 1.0), on_ball])
+@pytest.mark.parametrize("lift", [pytest.param(along(1.3, 1.0), marks=pytest.mark.slow), on_ball])
 def test_contacts_on_a_stretched_sheet_are_where_and_as_large_as_they_are(
     small: SensorDescription, lift: Callable[[float, float], Point]
 ) -> None:

@@ -168,12 +168,13 @@ def test_a_poor_contact_alone_does_no_harm(show: Show, paper: SensorDescription)
     assert_found(frame, PRESS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "pair",
-    [(3, 4), pytest.param((1, 9), marks=pytest.mark.slow)],
+    [(3, 4), (1, 9)],
     ids=str,
 )
-@pytest.mark.parametrize("when", ["at the tare", pytest.param("later", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("when", ["at the tare", "later"])
 def test_a_short_is_flagged(
     show: Show, simulator: SkinSimulator, pair: tuple[int, int], when: str
 ) -> None:
@@ -240,7 +241,9 @@ def test_a_tare_under_load_is_flagged_at_once_and_after_the_lift(show: Show, ski
     assert Flag.REFERENCE_MISMATCH in reconstructor.reconstruct(**skin.scan()).flags
 
 
-@pytest.mark.parametrize("channel", ["magnitude", "structure"])
+@pytest.mark.parametrize(
+    "channel", [pytest.param("magnitude", marks=pytest.mark.slow), "structure"]
+)
 def test_a_lift_after_a_tare_under_load_shows_in_either_channel(
     show: Show, simulator: SkinSimulator, channel: str
 ) -> None:
@@ -257,6 +260,7 @@ def test_a_lift_after_a_tare_under_load_shows_in_either_channel(
     assert Flag.REFERENCE_MISMATCH in lifted.flags
 
 
+@pytest.mark.slow
 def test_swapped_channels_are_told(show: Show) -> None:
     def swap(scans: Scans) -> Scans:
         return {"magnitude": scans["structure"], "structure": scans["magnitude"]}
@@ -272,7 +276,7 @@ def test_swapped_channels_are_told(show: Show) -> None:
         ("magnitude", 0.5),
         pytest.param("magnitude", 1.3, marks=pytest.mark.slow),
         pytest.param("structure", 0.7, marks=pytest.mark.slow),
-        ("structure", 2.0),
+        pytest.param("structure", 2.0, marks=pytest.mark.slow),
     ],
 )
 def test_a_gain_that_changes_is_told_as_one_and_not_as_a_swap(
@@ -287,7 +291,7 @@ def test_a_gain_that_changes_is_told_as_one_and_not_as_a_swap(
         assert bool(is_told) == (scan is rest)
 
 
-@pytest.mark.parametrize("gain", [0.2, pytest.param(0.35, marks=pytest.mark.slow), 0.5])
+@pytest.mark.parametrize("gain", [pytest.param(0.2, marks=pytest.mark.slow), 0.5])
 def test_a_gain_that_a_press_of_the_whole_sheet_would_explain_is_told(
     reconstructor: Reconstructor, skin: Skin, gain: float
 ) -> None:

@@ -89,7 +89,7 @@ def test_a_noisier_scan_has_its_own_noise_and_no_flag(
     assert all(bench.changes(times * NOISE).quiet for _ in range(200))
 
 
-@pytest.mark.parametrize("times", [0.1, 10.0])
+@pytest.mark.parametrize("times", [0.1, pytest.param(10.0, marks=pytest.mark.slow)])
 def test_against_a_tare_of_one_scan_each_scan_tells_its_own(
     converter: Callable[..., Bench], simulator: SkinSimulator, times: float
 ) -> None:
@@ -109,6 +109,7 @@ def test_pressing_is_no_noise(converter: Callable[..., Bench]) -> None:
     assert (bench.ratios(NOISE, PRESS, of=tare) == 1).mean() >= 0.99
 
 
+@pytest.mark.slow
 def test_noise_that_grows_with_the_change_is_explained(
     tared: Tared, simulator: SkinSimulator
 ) -> None:

@@ -12,7 +12,7 @@ RIM = load_description("palm_l").electrodes.positions_m or ()
 PADS = ((-0.03, 0.02), (-0.03, -0.03), (0.03, -0.03))
 
 
-@pytest.mark.parametrize("inside", [PADS, PADS[::-1]])
+@pytest.mark.parametrize("inside", [pytest.param(PADS, marks=pytest.mark.slow), PADS[::-1]])
 def test_presses_beside_pads_are_no_invalid_voltages(
     inside: tuple[tuple[float, float], ...],
 ) -> None:
@@ -30,6 +30,7 @@ def test_presses_beside_pads_are_no_invalid_voltages(
         assert np.hypot(contact.x_m - x_m, contact.y_m - y_m) < 1e-3
 
 
+@pytest.mark.slow
 def test_pads_on_an_axis_of_symmetry_spoil_nothing() -> None:
     """Some voltages between them are next to nothing at rest."""
     rim = [(-0.03, -0.075), (0.03, -0.075), (0.075, -0.03), (0.075, 0.03)]

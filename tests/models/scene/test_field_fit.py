@@ -126,6 +126,7 @@ def test_a_family_may_lay_out_what_it_draws_as_it_likes(sensor: Sensor) -> None:
     np.testing.assert_array_equal(fit.jacobian(one, data), fit.jacobian(other, data))
 
 
+@pytest.mark.slow
 def test_a_small_press_keeps_its_force_where_the_sheet_changes_much(
     forward: ForwardModel, small: SensorDescription
 ) -> None:
