@@ -9,7 +9,7 @@ import pytest
 from newcomer import Newcomer
 from page import Page
 from recorded_grasp import LAST_PRESSED, contacts_of, write_grasp
-from tactomo.cli.files.csv import CONTACT_COLUMNS, FRAME_COLUMNS
+from tactomo.cli.files.export import CONTACT_COLUMNS, FRAME_COLUMNS
 from tactomo_foxglove.topics import FRAME_SCHEMA
 from whole_system import repository
 

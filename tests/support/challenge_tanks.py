@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from tactomo_lab.evaluation.ktc import every_reading
-from tactomo_lab.tanks.images import pixel_grid
-from tactomo_lab.tanks.model import TankModel
+from tactomo_lab.tanks.model import TankModel, pixel_grid
 from tactomo_models.arrays import FloatArray
 
 ELECTRODES = 32

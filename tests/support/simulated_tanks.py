@@ -14,7 +14,7 @@ from tactomo_lab.scenes.simulation import (
     fine_mesh,
     fitted_mesh,
 )
-from tactomo_lab.tanks.images import pixel_grid
+from tactomo_lab.tanks.model import pixel_grid
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.mesh import SheetMesh
 from tactomo_models.scene.press import Press

@@ -5,7 +5,6 @@ same things on the same topics, which `topics` lists. Needs foxglove-sdk, the ex
 """
 
 from tactomo_foxglove.bridge import Bridge, BridgeError
-from tactomo_foxglove.layout import layout_for, shipped_layout
-from tactomo_foxglove.topics import write_mcap
+from tactomo_foxglove.topics import layout_for, shipped_layout, write_mcap
 
 __all__ = ["Bridge", "BridgeError", "layout_for", "shipped_layout", "write_mcap"]

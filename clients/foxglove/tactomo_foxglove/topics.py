@@ -6,7 +6,9 @@ there has a `trace`, which it keeps for as long as it is followed (`tactomo_clie
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping
+from importlib import resources
 from typing import IO, Any, Final
 
 import foxglove
@@ -189,3 +191,16 @@ def write_mcap(
     except RuntimeError as error:  # so it says that an earlier write had failed
         raise OSError(f"the file could not be written: {error}") from error
     return count
+
+
+def shipped_layout() -> str:
+    """Return the shipped layout, of a sensor named `skin`."""
+    return (resources.files("tactomo_foxglove") / "tactomo_layout.json").read_text("utf-8")
+
+
+def layout_for(sensor: str) -> str:
+    """Return the layout for a sensor of this name, to be imported in Foxglove."""
+    text = shipped_layout()
+    if not re.fullmatch(r"\w+", sensor):  # a message path quotes a topic of other characters
+        text = text.replace('"/skin/frame.', '"\\"/skin/frame\\".')
+    return text.replace("/skin/", f"/{sensor}/").replace('"skin"', f'"{sensor}"')

@@ -20,8 +20,7 @@ from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, ClientError, Keys, a
 from tactomo_client.connection import is_loopback, names_this_computer
 from tactomo_client.schema import FRAME_STALE_AFTER_S, STALE_AFTER_S
 
-from tactomo_viewer.browser import Browser, Feed
-from tactomo_viewer.wire import json_text, sent_ms
+from tactomo_viewer.browser import Browser, Feed, json_text, sent_ms
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8750

@@ -30,9 +30,8 @@ from tactomo.acquisition.open_serial import (
 )
 from tactomo.errors import PortAbsentError, TactomoError
 from tactomo.events import OnEvent
-from tactomo.recordings.playback import Playback
 from tactomo.recordings.recording import Chunk, Recording
-from tactomo.recordings.replay import parse_replay_url
+from tactomo.recordings.replay import Playback, parse_replay_url
 
 MAX_READ_BYTES: Final = 65_536
 """Taken at once at most, so that a flood of noise cannot keep the thread from its other duties."""

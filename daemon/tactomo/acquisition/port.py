@@ -37,10 +37,9 @@ from tactomo.acquisition.liveness import DeviceState, Liveness
 from tactomo.acquisition.open_serial import other_holders
 from tactomo.events import OnEvent, Rises, times
 from tactomo.protocols import PortProtocol, Trouble
-from tactomo.recordings.active_recording import ActiveRecording
-from tactomo.recordings.playback import Playback
 from tactomo.recordings.recorder import Recorder
-from tactomo.recordings.recording_writer import port_entry, preamble_entry
+from tactomo.recordings.recording_writer import ActiveRecording, port_entry, preamble_entry
+from tactomo.recordings.replay import Playback
 from tactomo.scans import ChannelScan, Delivery
 from tactomo.timing import wall_clock_ns
 from tactomo.worker import Worker

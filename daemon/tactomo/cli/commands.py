@@ -51,7 +51,7 @@ COMMANDS = {
         (RUN, "daemon", "Read a skin's ports and publish maps and contacts.", "run.daemon"),
         (RUN, "ports", "List serial adapters and their problems.", "run.ports"),
         (RUN, "zenoh", "Carry streams beyond this computer by Zenoh.", "run.serve"),
-        (RUN, "twin", "Simulate a skin behind simulated firmware.", "run.twin"),
+        (RUN, "twin", "Simulate a skin behind simulated firmware.", "run.demo"),
         (RUN, "viewer", "Serve a web page with a daemon's maps and contacts.", "run.serve"),
         (RUN, "foxglove", "Serve maps, contacts and events to Foxglove.", "run.serve"),
         (STEER, "status", "Show the daemon's state, problems first.", "steer.status"),

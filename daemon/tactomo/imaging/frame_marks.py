@@ -14,9 +14,13 @@ from typing import Final
 from tactomo_models import Reference
 
 from tactomo.imaging.kept_reference import KnownSkin
-from tactomo.recordings.active_recording import ActiveRecording
 from tactomo.recordings.recorder import Recorder
-from tactomo.recordings.recording_writer import calibration_entry, mark_entry, reference_entry
+from tactomo.recordings.recording_writer import (
+    ActiveRecording,
+    calibration_entry,
+    mark_entry,
+    reference_entry,
+)
 from tactomo.scans import DualScan, Mark, Timing
 from tactomo.timing import wall_clock_ns
 

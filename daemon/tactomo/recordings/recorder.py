@@ -23,9 +23,8 @@ import structlog
 from tactomo.config import RecordingConfig
 from tactomo.errors import CommandError, RecordingError, TactomoError
 from tactomo.events import OnEvent
-from tactomo.recordings.active_recording import MAX_QUEUED_BYTES, ActiveRecording
 from tactomo.recordings.recording import Origin
-from tactomo.recordings.recording_writer import create
+from tactomo.recordings.recording_writer import MAX_QUEUED_BYTES, ActiveRecording, create
 from tactomo.recordings.rotation import dated, is_numbered, list_recordings, next_path, to_delete
 from tactomo.timing import wall_clock_ns
 from tactomo.worker import Worker

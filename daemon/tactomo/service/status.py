@@ -20,9 +20,9 @@ from tactomo.imaging.frames import description_fields, port_fields, pressure_fie
 from tactomo.imaging.imaging import Imaging
 from tactomo.imaging.pipeline import Pipeline
 from tactomo.memory import resident_bytes
-from tactomo.recordings.playback import Playback
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import REPLAY_SCHEME
+from tactomo.recordings.replay import Playback
 from tactomo.service.health_issues import health_issues
 from tactomo.timing import Durations, LastMinute
 

@@ -35,7 +35,6 @@ from tactomo.plain import counted
 from tactomo.protocols import NATIVE, check_scan_fits, emulator_of, find_protocol
 from tactomo.protocols.interface import TWIN_ID, hello_of
 from tactomo.stream.commands import Nothing, explained
-from tactomo.twin.companions import SimulatedCompanions
 from tactomo.twin.control import (
     COMMANDS,
     ControlSocket,
@@ -48,7 +47,15 @@ from tactomo.twin.control import (
     PressArguments,
     ReleaseArguments,
 )
-from tactomo.twin.firmware import RATE_HZ_MAX, RATE_HZ_MIN, Converter, Firmware, Port, Voltages
+from tactomo.twin.firmware import (
+    RATE_HZ_MAX,
+    RATE_HZ_MIN,
+    Converter,
+    Firmware,
+    Port,
+    SimulatedCompanions,
+    Voltages,
+)
 from tactomo.twin.foreign import Emulator, ForeignFirmware
 from tactomo.twin.line import SerialLine
 from tactomo.twin.scene import Indenter, Scene, SkinDriftSettings

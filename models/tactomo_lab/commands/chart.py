@@ -1,34 +1,102 @@
 """The chart of `tactomo bench`: every method's speed against its accuracy, on simulated scenes.
 
-Presses of mixed kinds on skins made by hand: still scenes at three signal-to-noise ratios and
-moving ones, all with reporting seeds.
+Presses of mixed kinds on skins made by hand, all with reporting seeds, under every budget. *Still*
+scenes at three signal-to-noise ratios: each by itself from a cold start, so that a budget which
+ends early leaves what one frame could do. *Moving*: frame after frame as the daemon has them, so
+that what one frame does not finish the next one goes on with; every frame is reconstructed, however
+long that takes.
+
+In the picture, all words stand beside the panels, so that none lies over a point or another word.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from tactomo.cli.output import say
 from tactomo.cli.plot.plot import prepare_picture, save_figure
 from tactomo_models import available_methods, load_description
 from tactomo_models.arrays import FloatArray
+from tactomo_models.batch import BUDGET_S
+from tactomo_models.methods.registry import BUDGETED
+from tactomo_models.reconstruct import DEFAULT_BUDGET_S
 
 from tactomo_lab.commands.report import shown, usable
-from tactomo_lab.evaluation import trade_off
 from tactomo_lab.evaluation.moving import mixed_sequence
-from tactomo_lab.evaluation.play import play
+from tactomo_lab.evaluation.play import Outcome, Variant, play
 from tactomo_lab.evaluation.regimes import make_case
-from tactomo_lab.evaluation.trade_off import Point, panels, pareto_front
 from tactomo_lab.scenes.case import Case
+from tactomo_lab.scenes.measures import Summary, summarise_by
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+SceneKind = Literal["still", "moving"]
+
+UNHURRIED: Final = ("levelset",)  # charted under the last budget alone
+BUDGETS_S: Final = (0.001, 0.002, 0.005, 0.01, 0.02, DEFAULT_BUDGET_S)
+STILL_BUDGETS_S: Final = (*BUDGETS_S, BUDGET_S)  # the last one: as much as a scene needs
+
+
+def variants(methods: Iterable[str], budgets_s: Sequence[float] = BUDGETS_S) -> list[Variant]:
+    """Every method: `auto` under each of some budgets, others that one bounds under the last."""
+    chosen = []
+    for method in methods:
+        if method not in BUDGETED:
+            chosen.append(Variant(method))
+        else:
+            budgets = budgets_s[-1:] if method in UNHURRIED else budgets_s
+            chosen += [Variant(method, budget_s) for budget_s in budgets]
+    return chosen
+
+
+@dataclass(frozen=True)
+class Point:
+    """How fast and how right a variant is on scenes of one kind."""
+
+    scene: SceneKind
+    snr_db: float
+    variant: Variant
+    summary: Summary
+
+
+def points_of(outcomes: Iterable[Outcome]) -> list[Point]:
+    """What became of cases, one point for each kind of scene, ratio and variant."""
+
+    def key(outcome: Outcome) -> tuple[SceneKind, float, Variant]:
+        kind: SceneKind = "still" if outcome.case.is_still else "moving"
+        return kind, outcome.score.snr_db, outcome.variant
+
+    found = summarise_by((key(outcome), outcome.score) for outcome in outcomes)
+    return [Point(*of, summary) for of, summary in found.items()]
+
+
+def panels(points: Iterable[Point]) -> Iterator[list[Point]]:
+    """Points that can be compared: of one kind of scene and one signal-to-noise ratio."""
+    groups: dict[tuple[SceneKind, float], list[Point]] = {}
+    for point in points:
+        groups.setdefault((point.scene, point.snr_db), []).append(point)
+    yield from groups.values()
+
+
+def pareto_front(points: Sequence[Point]) -> list[Point]:
+    """Points than which none is both as fast and as right, and better in one; fastest first."""
+    known = [point for point in points if np.isfinite(point.summary.icc)]
+    best = [one for one in known if not any(_dominates(other, one) for other in known)]
+    return sorted(best, key=lambda point: point.summary.seconds)
+
+
+def _dominates(one: Point, other: Point) -> bool:
+    a, b = ((point.summary.seconds, -point.summary.icc) for point in (one, other))
+    return a != b and a[0] <= b[0] and a[1] <= b[1]
+
 
 STILL_SNR_DB: Final = (40.0, 20.0, 10.0)
 CONTACTS: Final = 4  # mixed scenes have one to so many, in turns
@@ -71,7 +139,7 @@ def chart(
 
 def measure_chart(
     name: str, count: int, methods: Sequence[str] = ()
-) -> tuple[list[trade_off.Point], list[str]]:
+) -> tuple[list[Point], list[str]]:
     """Measure methods, with a progress bar in the terminal; also return what is wrong with times.
 
     Raises:
@@ -85,17 +153,17 @@ def measure_chart(
         what = f"still scenes, {snr_db:g} dB"
         mixed = (make_case(sensor, "mixed", SEEDS, n, snr_db=snr_db) for n in range(scenes))
         made = list(shown(mixed, scenes, f"simulating {what}"))
-        drawn.append((what, trade_off.STILL_BUDGETS_S, made))
+        drawn.append((what, STILL_BUDGETS_S, made))
     numbers = range(sequences(count))
     moving = (mixed_sequence(sensor, SEEDS, number, "each change") for number in numbers)
     made = list(shown(moving, len(numbers), "simulating moving scenes"))
-    drawn.append(("moving scenes", trade_off.BUDGETS_S, made))
+    drawn.append(("moving scenes", BUDGETS_S, made))
     points = []
     with _warned_if_busy() as warnings:
         for what, budgets_s, cases in drawn:
-            asked = trade_off.variants(methods, budgets_s)
+            asked = variants(methods, budgets_s)
             total = len(asked) * sum(len(case.frames) for case in cases)
-            points += trade_off.points_of(shown(play(cases, *asked), total, f"measuring on {what}"))
+            points += points_of(shown(play(cases, *asked), total, f"measuring on {what}"))
     return points, warnings
 
 
@@ -123,11 +191,11 @@ def _warned_if_busy() -> Iterator[list[str]]:
         say(f"{busy}; run it again when nothing else runs", err=True)
 
 
-def rows_of(points: Sequence[trade_off.Point]) -> list[dict[str, Any]]:
+def rows_of(points: Sequence[Point]) -> list[dict[str, Any]]:
     """Return the points as flat rows, for JSON; in each panel the fastest first."""
     rows = []
-    for panel in trade_off.panels(points):
-        front = trade_off.pareto_front(panel)
+    for panel in panels(points):
+        front = pareto_front(panel)
         for point in sorted(panel, key=lambda p: p.summary.seconds):
             summary, budget_s = point.summary, point.variant.budget_s
             rows.append(

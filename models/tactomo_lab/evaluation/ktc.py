@@ -22,8 +22,7 @@ from tactomo_models.sensor.description import SensorDescription
 
 from tactomo_lab.evaluation.measured_sets import check_pictures, read_set
 from tactomo_lab.tanks.fit import TankFit
-from tactomo_lab.tanks.images import pixel_grid
-from tactomo_lab.tanks.model import Readings, TankModel
+from tactomo_lab.tanks.model import Readings, TankModel, pixel_grid
 
 WATER_SIGMA = 0.05  # of the scale's logarithm; four measured empty tanks leave the model 0.04 off
 WINDOW = 80  # pixels, standard deviation of the score's window; it ends at twice that

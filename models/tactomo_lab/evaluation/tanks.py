@@ -33,8 +33,7 @@ from tactomo_models.sensor.description import SensorDescription
 from tactomo_lab.evaluation.measured_sets import check_pictures, read_set
 from tactomo_lab.scenes.measures import correlation
 from tactomo_lab.tanks.fit import TankFit
-from tactomo_lab.tanks.images import pixel_grid, probabilities, signed_image
-from tactomo_lab.tanks.model import Readings, TankModel
+from tactomo_lab.tanks.model import Readings, TankModel, pixel_grid, probabilities, signed_image
 
 BUDGET_S = 20.0  # a file has no deadline
 EXACT = 10**6  # scans that a reference without noise is the mean of

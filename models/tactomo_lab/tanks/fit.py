@@ -19,15 +19,16 @@ from scipy.spatial.distance import cdist
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scene.drawing import heaviside, heaviside_slope
 
-from tactomo_lab.tanks.images import (
+from tactomo_lab.tanks.model import (
     PIXELS,
     LinearImages,
+    Readings,
+    TankModel,
     gaussian_grid,
     pixel_grid,
     probabilities,
     signed_image,
 )
-from tactomo_lab.tanks.model import Readings, TankModel
 
 WIDTH = 0.096  # of a Gaussian over the radius
 SPACING = 1.1  # of the grid, over that

@@ -24,8 +24,7 @@ from tactomo_protocol import Channel
 
 from tactomo_lab.scenes.measures import full_range
 from tactomo_lab.training.batches import SceneBatches
-from tactomo_lab.training.networks import FusionNetwork
-from tactomo_lab.training.objectives import FusionObjective, linear_images
+from tactomo_lab.training.networks import FusionNetwork, FusionObjective, linear_images
 from tactomo_lab.training.train import Settings, Training
 
 OPSET: Final = 18

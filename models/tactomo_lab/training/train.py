@@ -15,7 +15,7 @@ from tactomo_models.archive import write_whole
 from tactomo_models.errors import ModelError
 from torch import Tensor, nn
 
-from tactomo_lab.training.objectives import FusionObjective
+from tactomo_lab.training.networks import FusionObjective
 
 AVERAGED = 0.998  # of the averaged weights that each step keeps
 

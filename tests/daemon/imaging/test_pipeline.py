@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from tactomo.imaging import pipeline as module
 from tactomo.imaging.pipeline import Pipeline
-from tactomo.recordings.playback import Playback
-from tactomo.recordings.replay import Replay
+from tactomo.recordings.replay import Playback, Replay
 from tactomo.scans import ChannelScan, Delivery, DualScan
 from tactomo_protocol import Channel, ScanFlag
 from waiting import PATIENCE_S, wait_until

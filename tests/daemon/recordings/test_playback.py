@@ -14,9 +14,9 @@ from fixture_types import Start
 from tactomo.config import load_config
 from tactomo.imaging.imaging import MOVED_BUDGET_MS
 from tactomo.protocols import protocol_named
-from tactomo.recordings.playback import Playback
 from tactomo.recordings.recording import Origin, open_recording
 from tactomo.recordings.recording_writer import RecordingWriter
+from tactomo.recordings.replay import Playback
 from tactomo.service.daemon import Daemon
 from tactomo.service.status import STALE_S
 from tactomo_client import ControlError

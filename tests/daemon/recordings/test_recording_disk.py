@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 from daemon_bench import scan_counters
 from fixture_types import Start
-from tactomo.recordings import active_recording, recorder
+from tactomo.recordings import recorder, recording_writer
 from tactomo.recordings.recording import open_recording
 from tactomo.recordings.recovery import recover
 from tactomo_client import ControlError, request
@@ -183,7 +183,7 @@ def test_a_disk_that_stays_stuck_ends_the_recording_when_enough_waits(
     stuck_disk: tuple[Path, Callable[[str], None]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(active_recording, "MAX_QUEUED_BYTES", 200_000)
+    monkeypatch.setattr(recording_writer, "MAX_QUEUED_BYTES", 200_000)
     disk, turn = stuck_disk
     b = bench(recording={"folder": disk / "set", "at_start": True}).tare()
     turn("-f")

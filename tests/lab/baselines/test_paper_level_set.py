@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 from noisy_skin import Skin
-from tactomo_lab.baselines.paper_level_set import MAX_TRIALS, PaperLevelSet
+from tactomo_lab.baselines.paper_methods import MAX_TRIALS, PaperLevelSet
 from tactomo_models import (
     Artifact,
     Flag,
@@ -118,5 +118,5 @@ def test_steps_that_run_out_are_flagged(
     press = Press(0.02, 0.03, 180.0)
     assert Flag.NOT_CONVERGED not in frame_of(paper_method, skin, [press]).flags
     assert MAX_TRIALS > 3
-    monkeypatch.setattr("tactomo_lab.baselines.paper_level_set.MAX_TRIALS", 3)
+    monkeypatch.setattr("tactomo_lab.baselines.paper_methods.MAX_TRIALS", 3)
     assert Flag.NOT_CONVERGED in frame_of(paper_method, skin, [press]).flags

@@ -11,9 +11,8 @@ import pytest
 from fixture_types import Run
 from matplotlib.text import Text
 from tactomo_lab.commands import chart as bench_chart
-from tactomo_lab.commands.chart import draw_chart
+from tactomo_lab.commands.chart import Point, draw_chart
 from tactomo_lab.evaluation.play import Variant
-from tactomo_lab.evaluation.trade_off import Point
 from tactomo_lab.scenes.measures import summarise
 from tactomo_models import available_methods
 from tactomo_models.sensor.description_file import shipped_text

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tactomo_lab.evaluation.play import Variant, play
-from tactomo_lab.evaluation.trade_off import (
+from tactomo_lab.commands.chart import (
     Point,
     panels,
     pareto_front,
     points_of,
     variants,
 )
+from tactomo_lab.evaluation.play import Variant, play
 from tactomo_lab.scenes.case import draw_still, still_case
 from tactomo_lab.scenes.measures import summarise
 from tactomo_models import SensorDescription, available_methods

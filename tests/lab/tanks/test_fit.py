@@ -8,8 +8,7 @@ from challenge_tanks import challenge_pattern
 from tactomo_lab.evaluation.ktc import score
 from tactomo_lab.tanks import fit as fitting
 from tactomo_lab.tanks.fit import TankFit
-from tactomo_lab.tanks.images import pixel_grid
-from tactomo_lab.tanks.model import Readings, TankModel
+from tactomo_lab.tanks.model import Readings, TankModel, pixel_grid
 from tactomo_models import load_description
 
 

@@ -1,22 +1,32 @@
-"""`tactomo calibrate`: a sensor's pressure scale, from what a load cell says."""
+"""`tactomo calibrate`: a sensor's pressure scale, from what a load cell says.
+
+The daemon is asked to look again for what its sensor keeps, where it looks at its start; what it
+finds may be another file than the one just kept, so what it says that it goes by is compared.
+"""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from tactomo.cli import options
 from tactomo.cli.output import say, table
 from tactomo.cli.plot.plot import picture_option, save_figure
-from tactomo.cli.sensors import find_sensor, name_of, newest_status
+from tactomo.cli.sensors import SensorError, find_commanded, find_sensor, name_of, newest_status
 from tactomo.plain import plain
 
 if TYPE_CHECKING:
     from rich.table import Table
-    from tactomo_models.calibration.calibration_file import PressureCalibration
+    from tactomo_client import CalibrationInForce
+    from tactomo_models.calibration.calibration_file import (
+        Kept,
+        KeptFiles,
+        Made,
+        PressureCalibration,
+    )
 
 ROWS = 9  # of the table
 
@@ -79,7 +89,6 @@ def live(
     from tactomo_models.calibration.calibration_file import CALIBRATIONS
 
     from tactomo.cli.calibrate.live import guided
-    from tactomo.cli.calibrate.reload import keep
 
     found = find_sensor(sensor, address, keys)
     status = to_status(newest_status(found.sensor, address, keys))
@@ -139,7 +148,6 @@ def fit(
     from tactomo_models.calibration.calibration_file import CALIBRATIONS
 
     from tactomo.cli.calibrate.fit import fitted
-    from tactomo.cli.calibrate.reload import keep
 
     name = name_of(sensor)
     path = output or CALIBRATIONS.path(name)
@@ -188,8 +196,6 @@ def reload(
     keys: options.KeysFolder = None,
 ) -> None:
     """Make the running daemon read its calibration file again."""
-    from tactomo.cli.calibrate.reload import reload_kept
-
     say(reload_kept(sensor, address, keys))
 
 
@@ -296,3 +302,79 @@ def draw_calibration(made: PressureCalibration, output: Path) -> None:
     axes.legend(fontsize=8, loc="upper left")
     axes.grid(alpha=0.3)
     save_figure(figure, output)
+
+
+CONNECT_S: Final = 1.0  # how long to wait where nobody listens: there need not be a daemon
+
+
+def reload_kept(name: str | None, address: str | None, keys: Path | None) -> str:
+    """Have the daemon of a sensor read its calibration again; return in words what is in force."""
+    there = find_commanded(name, address, keys)
+    found = _reloaded(there.control, keys)
+    return f"in force now: the daemon of {there.sensor} goes by {_words(found)}"
+
+
+def keep(
+    files: KeptFiles[Made], made: Made, path: Path, address: str | None, keys: Path | None
+) -> None:
+    """Write what was made into a file, and have its sensor's daemon go by it, if that runs."""
+    files.save(made, path)
+    say(f"kept in {path}")
+    say(taken_up(files, made, path, address, keys))
+
+
+def taken_up(
+    files: KeptFiles[Made], made: Made, path: Path, address: str | None, keys: Path | None
+) -> str:
+    """Have the sensor's daemon, if it runs, use what was kept; say in words what became of it."""
+    from tactomo_client import CalibrationRefused, ClientError, KeysError
+
+    sensor = made.subject.sensor
+    own = files.path(sensor)
+    again = f"tactomo calibrate reload --sensor {sensor}"
+    try:
+        found = _reloaded(find_commanded(sensor, address, keys).control, keys)
+    except CalibrationRefused as error:
+        return f"not in force: the daemon of {sensor} refused it: {error}"
+    except KeysError as error:
+        return (
+            f"not in force yet: {error.cause}. Have somebody who may command run {again}, or start "
+            "the daemon anew"
+        )
+    except (ClientError, SensorError) as error:
+        it = "It" if path.absolute() == own.absolute() else f"Copied to {own}, it"
+        later = f"{it} is in force when the daemon of {sensor} starts next, or by: {again}"
+        return f"not in force yet: {error.cause}. {later}"
+    if _is_in_force(made, found):
+        return f"in force now: the daemon of {sensor} goes by it"
+    return (
+        f"not in force: the daemon of {sensor} goes by {_words(found)}. It looks on its own "
+        f"computer, in its own data folder, or where its configuration says: copy {path} there, "
+        f"then {again}"
+    )
+
+
+def _reloaded(control: str, keys: Path | None) -> CalibrationInForce:
+    from tactomo_client import Daemon
+
+    with Daemon(control, keys=keys, connect_timeout_s=CONNECT_S) as daemon:
+        return daemon.reload_calibration()
+
+
+def _is_in_force(made: Kept, found: CalibrationInForce) -> bool:
+    from tactomo_models.calibration.calibration_file import PressureCalibration
+
+    if not isinstance(made, PressureCalibration):
+        return found.taught is not None and found.taught.taken == made.taken
+    its = found.calibration
+    kept = (made.taken, len(made.readings), made.curve.range_kpa)
+    return its is not None and (its.taken, its.readings, its.range_kpa) == kept
+
+
+def _words(found: CalibrationInForce) -> str:
+    curve, taught = found.calibration, found.taught
+    words = "the description's table"
+    if curve is not None:
+        low, high = curve.range_kpa
+        words = f"{curve.readings} readings of {curve.taken}, {low:.0f} to {high:.0f} kPa"
+    return words if taught is None else f"{words}; {taught.presses} presses of {taught.taken}"

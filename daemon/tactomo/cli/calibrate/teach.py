@@ -139,7 +139,7 @@ def _teach(
     from tactomo_models.calibration.taught_skin import TAUGHT
     from tactomo_models.commissioning.teach import read_presses, teach
 
-    from tactomo.cli.calibrate.reload import keep
+    from tactomo.cli.calibrate.calibrate import keep
 
     with progress_bar("reconstructing presses") as show:
         known = read_presses(presses, description)

@@ -24,8 +24,7 @@ import numpy as np
 from tactomo_models.arrays import FloatArray
 from tactomo_models.foreign_file import open_regular
 
-from tactomo.cli.files.gaps import Gaps
-from tactomo.cli.files.recorded_frames import Moment
+from tactomo.cli.files.recorded_frames import Gaps, Moment
 from tactomo.errors import TactomoError, needs
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from tactomo_client.appearance import force_words, pressure_words
 from tactomo_models import Flag, SensorDescription
 
 from tactomo.cli.console import Console
-from tactomo.cli.files.csv import ARRAY_COLUMNS
+from tactomo.cli.files.export import ARRAY_COLUMNS
 from tactomo.cli.output import say, table
 from tactomo.cli.plot.course import telling_moments
 from tactomo.imaging.frames import ends_mm

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from tactomo.cli.files.gaps import missing
-from tactomo.cli.files.recorded_frames import Moment, RecordedFrames
+from tactomo.cli.files.recorded_frames import Moment, RecordedFrames, missing
 
 if TYPE_CHECKING:
     from tactomo_client import Contact

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from tactomo_models import SensorDescription
 
     from tactomo.config import DaemonConfig
-    from tactomo.recordings.playback import Playback
     from tactomo.recordings.recording import Recording
+    from tactomo.recordings.replay import Playback
 
 app = options.typer_app()
 
