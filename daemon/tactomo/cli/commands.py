@@ -6,7 +6,7 @@ adds commands by entry points, as the laboratory does::
     [project.entry-points."tactomo.commands"]
     evaluate = "tactomo_lab.commands.evaluate:app"        # tactomo evaluate ...
     "models.train" = "tactomo_lab.commands.training:app"  # tactomo models train
-    "evaluate.paper" = "tactomo_lab.commands.evaluate_paper:app"  # tactomo evaluate paper
+    "evaluate.ktc" = "tactomo_lab.commands.measured:app"  # tactomo evaluate ktc
 
 The entry point's name is the command's; a dot leads into a group of commands. A Typer that holds
 several commands gives the one of that name; one without it becomes a group of this name.

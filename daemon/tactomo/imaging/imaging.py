@@ -32,9 +32,8 @@ from tactomo.config import BaselineConfig
 from tactomo.events import OnEvent
 from tactomo.imaging import frames
 from tactomo.imaging.calibration_in_force import CalibrationInForce
-from tactomo.imaging.companions import Companions
+from tactomo.imaging.companions import Companions, FrozenConverters
 from tactomo.imaging.frame_marks import FrameMarks, InForce
-from tactomo.imaging.frozen_converter import FrozenConverters
 from tactomo.imaging.kept_reference import KeptReference, KnownSkin
 from tactomo.imaging.method_in_force import Effort, MethodInForce, ProcessorShare
 from tactomo.imaging.tare import Taring

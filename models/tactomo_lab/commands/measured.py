@@ -85,7 +85,7 @@ def _round_skin(path: Path, sensor: str) -> Finding:
     import numpy as np
     from tactomo_models import load_description
 
-    from tactomo_lab.evaluation.skin_presses import localise, read_presses
+    from tactomo_lab.evaluation.presses import localise, read_presses
 
     skin = load_description(sensor)
     presses = read_presses(path, skin)
@@ -124,7 +124,7 @@ def _taught_skins(path: Path, sensor: str, train: int = 200) -> Finding:
     """Learn each skin from its first presses and judge the last; any skin, whatever the sensor."""
     import numpy as np
 
-    from tactomo_lab.evaluation.taught_presses import judge, read_skins
+    from tactomo_lab.evaluation.presses import judge, read_skins
 
     known = read_skins(path)
     found = list(shown(judge(known, train), len(known), "skins"))

@@ -15,7 +15,7 @@ import pytest
 from daemon_bench import HELLO
 from fake_machine import FakeMachine
 from fixture_types import Run
-from tactomo.acquisition.identify import identify
+from tactomo.acquisition.connection import identify
 from tactomo.cli.run.ports import lines, question, survey
 from tactomo_protocol import Channel, Command, Decoder, encode
 from waiting import wait_until

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 from shared_data import measured
-from tactomo_lab.evaluation.skin_presses import IMAGE, TAUGHT, localise, read_presses
+from tactomo_lab.evaluation.presses import IMAGE, TAUGHT, localise, read_presses
 from tactomo_lab.evaluation.tanks import (
     TankImager,
     Tanks,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tactomo_lab.evaluation.skin_presses import (
+from tactomo_lab.evaluation.presses import (
     IMAGE,
     TAUGHT,
     Presses,

@@ -147,7 +147,7 @@ def fit(
     area = _area_mm2(diameter_mm, area_mm2)
     from tactomo_models.calibration.calibration_file import CALIBRATIONS
 
-    from tactomo.cli.calibrate.fit import fitted
+    from tactomo.cli.calibrate.live import fitted
 
     name = name_of(sensor)
     path = output or CALIBRATIONS.path(name)

@@ -105,7 +105,7 @@ def question(
     """Ask all ports at the same time who is there; in words why there is no hello."""
     from concurrent.futures import ThreadPoolExecutor
 
-    from tactomo.acquisition.identify import identify
+    from tactomo.acquisition.connection import identify
     from tactomo.protocols import NATIVE, find_protocol
 
     usual = find_protocol(protocol or NATIVE).baud
