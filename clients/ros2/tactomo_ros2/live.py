@@ -9,12 +9,7 @@ from typing import Final
 from tactomo_client import Event, Frame, Status, Subscription
 from tactomo_client.schema import Mount
 
-from tactomo_ros2.messages import (
-    RosMessage,
-    issue_diagnostics,
-    ros_messages,
-    stale_diagnostics,
-)
+from tactomo_ros2.messages import RosMessage, issue_diagnostics, ros_messages, stale_diagnostics
 
 WAIT_S: Final = 0.2
 """How soon a stop is noticed."""

@@ -16,7 +16,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, Self
 
 from tactomo.ending import AS_WELL, ASKED, VARIABLE, at_end
@@ -162,16 +163,14 @@ class Family:
                 child.stop(left_s * number / len(self._children))
 
 
-class no_interruption:  # noqa: N801 - reads as a statement
-    """A block during which signals to end are ignored: what stops everything must finish."""
-
-    def __enter__(self) -> None:
-        self._before = {
-            number: signal.signal(number, signal.SIG_IGN) for number in (*ASKED, *AS_WELL)
-        }
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
+@contextmanager
+def no_interruption() -> Iterator[None]:
+    """Ignore signals to end during a block: what stops everything must finish."""
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in (*ASKED, *AS_WELL)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
             signal.signal(number, handler)
 
 

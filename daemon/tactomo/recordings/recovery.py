@@ -29,13 +29,7 @@ from tactomo_protocol import SCAN_COUNTERS, Channel, Scan
 from tactomo.errors import RecordingError
 from tactomo.protocols import PortProtocol
 from tactomo.recordings.record_fields import read_reference_number
-from tactomo.recordings.recording import (
-    RECOVERED,
-    Origin,
-    open_file,
-    open_recording,
-    to_origin,
-)
+from tactomo.recordings.recording import RECOVERED, Origin, open_file, open_recording, to_origin
 from tactomo.recordings.recording_writer import RecordingWriter, pack_mark
 from tactomo.recordings.records import read_calibration, read_mark
 from tactomo.scans import ScanKey

@@ -81,14 +81,7 @@ from tactomo.running import Running, announced
 from tactomo.service.status import Status
 from tactomo.service.supervision import Supervision, notify
 from tactomo.stream.access_control import AccessControl, load_server_keys
-from tactomo.stream.control import (
-    Control,
-    Outcome,
-    SetBudget,
-    SetTier,
-    Settling,
-    SteerReplay,
-)
+from tactomo.stream.control import Control, Outcome, SetBudget, SetTier, Settling, SteerReplay
 from tactomo.stream.publisher import Publisher
 from tactomo.timing import wall_clock_ns
 from tactomo.worker import Worker

@@ -19,12 +19,7 @@ from typing import Annotated, Any, Final, NamedTuple
 import zmq
 from pydantic import AfterValidator, ConfigDict, Field
 from tactomo_client import MessageError
-from tactomo_client.messages import (
-    MAX_REQUEST_BYTES,
-    decode_request,
-    encode_error,
-    encode_reply,
-)
+from tactomo_client.messages import MAX_REQUEST_BYTES, decode_request, encode_error, encode_reply
 
 from tactomo.config import BudgetMs
 from tactomo.endpoint import rebind

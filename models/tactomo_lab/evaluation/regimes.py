@@ -23,14 +23,7 @@ from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.description_file import load_description
 from tactomo_protocol import Channel
 
-from tactomo_lab.scenes.case import (
-    BadLead,
-    Case,
-    Plan,
-    as_described,
-    measure,
-    simulate,
-)
+from tactomo_lab.scenes.case import BadLead, Case, Plan, as_described, measure, simulate
 from tactomo_lab.scenes.drawing import (
     PRESSURE_KPA,
     Placed,

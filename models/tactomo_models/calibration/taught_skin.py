@@ -19,10 +19,7 @@ from tactomo_protocol import Channel
 
 from tactomo_models.archive import read_arrays
 from tactomo_models.arrays import BoolArray, FloatArray
-from tactomo_models.calibration.calibration_file import (
-    KeptFiles,
-    Subject,
-)
+from tactomo_models.calibration.calibration_file import KeptFiles, Subject
 from tactomo_models.calibration.press_regression import ForceRegression, PressRegression
 from tactomo_models.errors import CalibrationError, DataError
 from tactomo_models.scans.measurement import Measurement

@@ -7,14 +7,7 @@ from itertools import combinations
 from typing import Annotated, Literal, Self, TypeVar
 
 import numpy as np
-from pydantic import (
-    Discriminator,
-    Field,
-    Tag,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
+from pydantic import Discriminator, Field, Tag, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from tactomo_models.arrays import FloatArray

@@ -28,12 +28,7 @@ from tactomo_protocol import SCAN_COUNTERS, Channel, Hello, Scan, ScanFlag
 
 from tactomo.cli.sensors import of_this_version
 from tactomo.errors import TactomoError
-from tactomo.recordings.imported_scans import (
-    AT_REST,
-    is_single_ended,
-    load_arrays,
-    read_scans,
-)
+from tactomo.recordings.imported_scans import AT_REST, is_single_ended, load_arrays, read_scans
 from tactomo.recordings.recording import Recording
 from tactomo.running import running
 from tactomo.service.health_issues import CORRUPT_NOTED, FIRMWARE_STEP

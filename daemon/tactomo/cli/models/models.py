@@ -11,7 +11,7 @@ import typer
 from tactomo.cli.commands import Group
 from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, examples, typer_app
 from tactomo.cli.output import say
-from tactomo.cli.plot.electrodes import draw_electrodes, outwards
+from tactomo.cli.plot.electrodes import draw_electrodes, outline_path, outwards
 from tactomo.cli.plot.plot import prepare_picture, save_figure
 from tactomo.plain import counted, plain
 
@@ -329,15 +329,9 @@ def _draw_sheet(axes: Axes, description: SensorDescription, paper_mm: float) -> 
 
 
 def _draw_outline(axes: Axes, description: SensorDescription, inset_m: float, **style: Any) -> None:
-    import numpy as np
     from matplotlib.patches import PathPatch
-    from matplotlib.path import Path as Line
 
-    rings = description.sheet.outline.drawn(inset_m)
-    closed = [Line(1e3 * np.vstack([ring, ring[:1]]), closed=True) for ring in rings]
-    shape = PathPatch(Line.make_compound_path(*closed), **style)
-    shape.set_clip_on(False)
-    axes.add_patch(shape)
+    axes.add_patch(PathPatch(outline_path(description, inset_m), **style)).set_clip_on(False)
 
 
 def _draw_pairs(axes: Axes, description: SensorDescription, paper_mm: float) -> None:

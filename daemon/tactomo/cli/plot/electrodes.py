@@ -1,4 +1,4 @@
-"""A sensor's electrodes, as its pictures show them: bars on the rim, discs inside, and numbers."""
+"""A sensor as its pictures show it: its outline, and electrodes as bars or discs, with numbers."""
 
 from __future__ import annotations
 
@@ -10,6 +10,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from tactomo_models import SensorDescription
     from tactomo_models.arrays import FloatArray
+
+
+def outline_path(description: SensorDescription, inset_m: float = 0.0) -> Any:
+    """Return the sheet's outline and holes, so far within, as matplotlib's path in millimetres."""
+    from matplotlib.path import Path
+
+    rings = description.sheet.outline.drawn(inset_m)
+    closed = [Path(1e3 * np.vstack([ring, ring[:1]]), closed=True) for ring in rings]
+    return Path.make_compound_path(*closed)
 
 
 def outwards(description: SensorDescription) -> FloatArray:

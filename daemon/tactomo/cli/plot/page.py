@@ -16,7 +16,7 @@ from tactomo_client.appearance import COLOURS, map_pixels, shown_image
 
 from tactomo.cli.files.recorded_frames import Moment
 from tactomo.cli.plot.course import Course, Track
-from tactomo.cli.plot.electrodes import draw_electrodes
+from tactomo.cli.plot.electrodes import draw_electrodes, outline_path
 from tactomo.imaging.frames import description_fields
 from tactomo.plain import counted, plain
 
@@ -127,11 +127,8 @@ def draw_strip(
 def _cut_out(axes: Any, description: SensorDescription) -> None:
     """Show a map within the sheet's outline alone."""
     from matplotlib.patches import PathPatch
-    from matplotlib.path import Path
 
-    rings = description.sheet.outline.drawn()
-    closed = [Path(1e3 * np.vstack([ring, ring[:1]]), closed=True) for ring in rings]
-    shape = PathPatch(Path.make_compound_path(*closed), transform=axes.transData)
+    shape = PathPatch(outline_path(description), transform=axes.transData)
     for image in axes.images:
         image.set_clip_path(shape)
 
