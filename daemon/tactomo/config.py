@@ -1,8 +1,8 @@
 """The daemon's configuration: a TOML file, and options that override it.
 
 Every key has a default but `ports`. Errors name the file, the key, its value and what is allowed.
-`tactomo service example` shows every key with its meaning, deploy/examples/robot.toml several skins
-in one file.
+deploy/daemon.example.toml says what each key means (`tactomo service example` prints it), and
+deploy/examples/robot.toml has several skins in one file.
 """
 
 from __future__ import annotations
@@ -75,27 +75,22 @@ BudgetMs = Annotated[float, Field(ge=0.01, le=10_000)]
 class Curve(BaseModel, extra="forbid", frozen=True):
     """Keys for addresses beyond this computer; `tactomo keys` makes and manages both."""
 
-    secret: FilePath  # the daemon's secret key, which only its user may read
-    clients: FilePath  # a folder of the public keys of those who may connect
+    secret: FilePath
+    clients: FilePath
 
 
 class RecordingConfig(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """Where recordings go, how they are cut into files, and which of those are kept."""
 
-    # Record to this one file from the start; it is not cut and not deleted
     file: FilePath | None = None
-    at_start: bool = False  # record to the folder from the start
-    maps: bool = False  # put maps and contacts into recordings, beside the raw bytes
-    # Where recordings without a name of their own go, cut into files as follows
+    at_start: bool = False
+    maps: bool = False
     folder: FilePath | None = None
     rotate_mb: Annotated[float, Field(ge=0.01, le=100_000)] = 256.0
     rotate_minutes: Annotated[float, Field(ge=0.01, le=1440)] = 60.0
-    # Of this sensor's files in the folder, the newest so many; 0 for no limit
     keep_gb: Annotated[float, Field(ge=0)] = 10.0
-    keep_days: Annotated[float, Field(ge=0)] = 0.0  # likewise by age
-    # What recording leaves free on the disk, or a tenth of it if that is less
+    keep_days: Annotated[float, Field(ge=0)] = 0.0
     reserve_mb: Annotated[float, Field(ge=0)] = 200.0
-    # How much may be lost with the power; 0 leaves it to the operating system
     sync_s: Annotated[float, Field(ge=0, le=3600)] = 5.0
 
     @model_validator(mode="after")
@@ -115,44 +110,33 @@ class RecordingConfig(BaseModel, extra="forbid", frozen=True, allow_inf_nan=Fals
 class BaselineConfig(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """Whether and how fast the reference follows a skin's drift while nothing presses."""
 
-    track: bool = True  # off: changes are measured against the last tare as it was
+    track: bool = True
     time_constant_s: Annotated[float, Field(ge=5, le=3600)] = TIME_CONSTANT_S
 
 
 class DaemonConfig(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """What one daemon serves: one sensor, read over one port or two."""
 
-    # This sensor's name in every topic, such as ``left_forearm``
     name: Annotated[str, _found_by(check_sensor_name)] = "skin"
-    # A shipped sensor description's name, or the path of a TOML file
     description: Annotated[str, BeforeValidator(_path)] = "paper_square"
-    # Of pressure, by `tactomo calibrate`; None for the sensor's own, where there is one
     calibration: FilePath | None = None
-    # Device paths or pyserial URLs: one that carries both channels, or one for each
     ports: Annotated[tuple[str, ...], Field(min_length=1, max_length=MAX_PORTS)]
-    # The devices that make up this sensor, as their hello says; empty accepts any
     device_ids: tuple[DeviceId, ...] = ()
-    wait_for_ports: bool = False  # start without a port that cannot be opened yet, and wait for it
-    # What the device speaks: ours, or that of other people's hardware
+    wait_for_ports: bool = False
     protocol: ProtocolName = NATIVE
-    # Of a real UART; None for what is usual with the protocol
     baud: Annotated[int, Field(ge=1200, le=12_000_000)] | None = None
     stream: Endpoint = DEFAULT_STREAM
     control: Endpoint = DEFAULT_CONTROL
-    # Encrypt ``tcp://`` addresses and let in the listed clients only; needed beyond loopback
     curve: Curve | None = None
-    method: MethodName = "auto"  # how to reconstruct: a method's name, or ``my_module:MyMethod``
-    # Work that one frame may take, in ms of a 2.5 GHz core; None leaves it to the method
+    method: MethodName = "auto"
     budget_ms: BudgetMs | None = None
-    tare_scans: Annotated[int, Field(ge=2, le=10_000)] = 20  # dual scans averaged into a reference
-    # How long a scan waits for the other channel's scan of the same instant
+    tare_scans: Annotated[int, Field(ge=2, le=10_000)] = 20
     sync_wait_ms: Annotated[float, Field(ge=0, le=1000)] = 30.0
-    lossless: bool = False  # reconstruct every dual scan, however late, instead of the newest one
+    lossless: bool = False
     baseline: BaselineConfig = BaselineConfig()
     recording: RecordingConfig = RecordingConfig()
-    # ``HOST:PORT`` of this computer where Prometheus may scrape
     metrics: MetricsAddress | None = None
-    exit_at_end: bool = False  # stop once every replayed port has reached the end of its recording
+    exit_at_end: bool = False
     log_level: LogLevel = "info"
     log_format: LogFormat = "auto"
 

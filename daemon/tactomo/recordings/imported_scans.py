@@ -1,21 +1,10 @@
 """Scans from files of other programs, as volts in the order of a sensor description.
 
-Three layouts are read, told apart by their arrays; Sciospec's .eit files are of the second (see
-`eit_files`), text of the third (see `tactomo_models.array_files`):
-
-batch
-    what `tactomo reconstruct` takes: `magnitude` and/or `structure` (T, M) volts in the
-    description's order; optionally `magnitude_reference`, `structure_reference` (M,) or (n, M) and
-    `t` (T,) seconds. A frame that is all NaN is a scan that did not arrive.
-
-single-ended
-    what impedance tomography instruments save: `volts` (T, injections, electrodes), complex or
-    real, each electrode against ground; `injection` (injections, 2), source and sink, numbered
-    from 0 or from 1; optionally `t` (T,) seconds.
-
-plain
-    any other array of one frame a row or a column: the description's voltages in order, or every
-    drive by every measuring pair; beside it maybe a reference by one of the names in `AT_REST`.
+Three layouts are read, told apart by their arrays: *batch* and *plain* are those of docs/files.md;
+*single-ended* is what impedance tomography instruments save, as in Sciospec's .eit files: `volts`
+(T, injections, electrodes), complex or real, each electrode against ground; `injection`
+(injections, 2), source and sink, numbered from 0 or from 1. `t` (T,) seconds may be in each, and a
+frame that is all NaN is a scan that did not arrive.
 
 A single-ended scan becomes differences V(m) - V(m + offset), and of complex volts the *real part*
 is taken. The field's own unit is the volt in phase with the current; in a mostly resistive body the

@@ -2,9 +2,7 @@
 
 Each step has the newest frame that had been *published* by then: what the robot could have known.
 
-A robot's log is a CSV file with a line of names: `monotonic_s` or `realtime_s`, Python's
-`time.monotonic()` or `time.time()` on the daemon's computer; `episode`, a number that changes with
-each; columns named `action.` and something; and any others, the robot's state. All are numbers.
+docs/lerobot.md has the format of a robot's log.
 """
 
 from __future__ import annotations
