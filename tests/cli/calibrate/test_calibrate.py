@@ -158,25 +158,6 @@ def test_the_daemon_that_runs_is_asked_to_read_it_again(tactomo: Run) -> None:
         assert "no sensor 'sole' runs on this computer, but palm" in other.stderr
 
 
-@pytest.mark.slow
-def test_without_a_daemon_it_says_when_it_will_be_in_force(tactomo: Run, tmp_path: Path) -> None:
-    (tmp_path / "log.csv").write_text(CSV)
-    for where in ((), ("--address", f"ipc://{tmp_path}/nobody"), ("--address", "nonsense")):
-        made = tactomo(*FIT, *where, status=0)
-        assert f"kept in {CALIBRATIONS.path('palm')}" in made.stdout
-        assert "not in force yet: " in made.stdout
-        assert "tactomo calibrate reload" in made.stdout
-    made = tactomo(*FIT, "-o", "elsewhere.json")
-    assert f"Copied to {CALIBRATIONS.path('palm')}" in made.stdout
-
-
-def test_a_name_that_no_sensor_can_have(tactomo: Run, tmp_path: Path) -> None:
-    (tmp_path / "log.csv").write_text(CSV)
-    result = tactomo("calibrate", "fit", "log.csv", "--sensor", "../palm", status=1)
-    assert "'../palm' is not a sensor name; use 1 to 64 letters" in result.stderr
-    assert not list(tmp_path.rglob("*.pressure.json"))
-
-
 @pytest.mark.parametrize(
     "options",
     [

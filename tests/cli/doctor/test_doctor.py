@@ -191,17 +191,6 @@ def test_what_a_recording_does_not_tell_is_said_of_a_recording(
     assert step in drift["next_step"]
 
 
-def test_of_a_slow_device_more_scans_are_asked_for(tactomo: Run, rest: FloatArray) -> None:
-    """Two scans of it take longer than two seconds."""
-    volts = noisy(rest, 2)
-    np.savez("in.npz", magnitude=volts, structure=volts, t=[0.0, 5.0])
-    tactomo("import", "in.npz", "in.mcap", status=0)
-    findings = report(tactomo("doctor", "in.mcap", "--json"))["channels"]["magnitude"]["findings"]
-    assert "in 5.0 s" in about(findings, "drift")["detail"]
-    assert "3 scans at rest, or more" in about(findings, "drift")["next_step"]
-    assert "--seconds" in about(findings, "snr")["next_step"]
-
-
 def test_scans_without_times_say_nothing_of_drift(tactomo: Run, rest: FloatArray) -> None:
     np.savez("in.npz", rest=noisy(rest))
     drift = about(

@@ -28,7 +28,6 @@ from recorded_grasp import (
 from small_sensor import SMALL
 from tactomo_models import Press, SkinSimulator, load_description
 from tactomo_protocol import Channel
-from terminal import Terminal
 from waiting import wait_until
 
 
@@ -95,16 +94,6 @@ def test_some_seconds_of_it(tactomo: Run, grasp: Path) -> None:
     assert (min(times), max(times)) == (1.0, 1.45)
 
 
-def test_a_recording_in_several_files(tactomo: Run, tmp_path: Path) -> None:
-    folder = tmp_path / "recordings"
-    folder.mkdir()
-    for number, part in enumerate((range(30), range(30, 60), range(60, FRAMES))):
-        write_grasp(folder / f"{SENSOR}-00000{number}-20231114T221320Z.mcap", part)
-    tactomo("export", folder, tmp_path / "all.csv", status=0)
-    times = sorted({float(row["time_s"]) for row in rows_of(tmp_path / "all.csv")})
-    np.testing.assert_allclose(times, np.arange(FRAMES) * PERIOD_NS * 1e-9)
-
-
 def test_a_wall_clock_that_is_set_does_not_fold_the_times(tactomo: Run, tmp_path: Path) -> None:
     def set_back(number: int) -> dict[str, Any]:
         hour = 3_600_000_000_000 if number >= 30 else 0
@@ -130,15 +119,6 @@ def test_a_daemon_that_was_restarted_begins_anew(tactomo: Run, tmp_path: Path) -
     np.testing.assert_allclose(times, np.arange(FRAMES) * PERIOD_NS * 1e-9)
     result = tactomo("plot", "two.mcap", "-o", "two.svg", "--what", "path")
     assert "wrote two.svg: 4 contacts" in result.stdout  # 1 and 2, then 1' and 2'
-
-
-def test_a_cut_recording_gives_what_is_there_and_says_so(tactomo: Run, grasp: Path) -> None:
-    data = grasp.read_bytes()
-    grasp.write_bytes(data[: len(data) * 2 // 3])
-    result = tactomo("export", grasp, "contacts.csv", status=0)
-    assert "is cut off or damaged" in result.stderr
-    frames = len({row["time_s"] for row in rows_of(grasp.with_name("contacts.csv"))})
-    assert FRAMES / 2 < frames < FRAMES
 
 
 def test_a_recording_cut_before_its_first_frame_has_nothing_to_export(
@@ -199,18 +179,6 @@ def test_what_is_there_is_written_over_only_if_one_says_so(tactomo: Run, grasp: 
         assert grasp.with_name(name).read_text() == "precious"
         tactomo(*arguments, "--force", status=0)
         assert grasp.with_name(name).read_text() != "precious"
-
-
-@pytest.mark.slow
-def test_at_a_terminal_it_asks(grasp: Path) -> None:
-    target = grasp.with_name("contacts.csv")
-    for answer in ("n", "y"):
-        target.write_text("precious")
-        with Terminal("export", str(grasp), str(target)) as terminal:
-            terminal.wait_for("write over it?")
-            terminal.enter(answer)
-            assert terminal.wait() == (answer == "n")
-        assert (target.read_text() == "precious") == (answer == "n")
 
 
 def bare_recording(tactomo: Run, tmp_path: Path, scans_pressed: int) -> Path:

@@ -131,13 +131,6 @@ def test_contacts_have_frames_and_covariances_and_messages_their_ages(exported: 
     assert "storage_identifier: mcap\n  " in (exported / "metadata.yaml").read_text()
 
 
-def test_where_the_sensor_hangs_is_not_told(tactomo: Run, tmp_path: Path) -> None:
-    """Two parents of one frame would break a robot's tree of transforms."""
-    write_grasp(tmp_path / "grasp.mcap", range(10))
-    tactomo("export", "grasp.mcap", "plain", "--ros2", status=0)
-    assert "/tf" not in read(tmp_path / "plain")
-
-
 def test_a_clock_that_jumps_and_lost_frames_are_named(tactomo: Run, tmp_path: Path) -> None:
     def change(number: int) -> dict[str, Any]:
         realtime_ns = START_NS + number * PERIOD_NS - (3_600_000_000_000 if number >= 30 else 0)

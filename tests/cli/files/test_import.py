@@ -207,12 +207,6 @@ def test_what_cannot_be_imported_is_refused(
     assert not (tmp_path / "out.mcap").exists()
 
 
-def test_what_is_no_npz_is_refused(tactomo: Run, tmp_path: Path) -> None:
-    (tmp_path / "in.npz").write_text("volts,volts")
-    assert "no .npz file of numbers" in tactomo("import", "in.npz", "out.mcap").stderr
-    assert "cannot read none.npz" in tactomo("import", "none.npz", "out.mcap").stderr
-
-
 def eit_text(volts: NDArray[np.complex128], date: str, first: int = 1) -> str:
     """A frame as Sciospec's program saves it, of all channels up to the last that was measured."""
     header = [18, 2, "setup_00001", date, "10000.0", "10000.0", 0, 1, "0.001", "20.0"]

@@ -31,13 +31,6 @@ def test_a_sensor_of_too_many_voltages_is_told_before_it_is_wired(
     assert facts["voltages a scan"] == "3904: of files alone, as a live scan has 1024 at most"
 
 
-def test_info_of_a_file_of_arrays(tactomo: Run, tmp_path: Path) -> None:
-    np.savez(tmp_path / "a.npz", sensor="x", sha256="y", jacobian=np.zeros((2, 3)))
-    facts = json.loads(tactomo("info", "a.npz", "--json").stdout)
-    assert (facts["kind"], facts["sensor"]) == ("artifact", "x")
-    assert facts["arrays"] == {"jacobian": "float64 (2, 3)"}
-
-
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [

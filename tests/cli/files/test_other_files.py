@@ -289,12 +289,6 @@ def test_any_pattern_is_applied_or_refused_by_name(name: str) -> None:
         assert sensor.electrodes.length_m * sensor.electrode_count == pytest.approx(0.008 * 16)
 
 
-def test_doctor_examines_them_too(tactomo: Run, tmp_path: Path) -> None:
-    (tmp_path / "rest.csv").write_text(text(np.vstack([tank()[0]] * 5)))
-    result = tactomo("doctor", tmp_path / "rest.csv", status=0)
-    assert "healthy" in result.stdout
-
-
 TAKES_FILES = settings(deadline=None, suppress_health_check=list(HealthCheck))
 
 

@@ -28,16 +28,6 @@ def test_a_sheet_is_drawn_true_to_scale(tactomo: Run, tmp_path: Path) -> None:
     assert rims_apart(tmp_path / "my_sheet.png", 50) == 0
 
 
-def test_a_disc_is_drawn_and_larger_ones_on_a_smaller_scale(tactomo: Run, tmp_path: Path) -> None:
-    large = SMALL.replace("width_m = 0.06\nheight_m = 0.05", "width_m = 0.8").replace(
-        "per_side = 2", "count = 8"
-    )
-    large = large.replace('"rectangle"', '"disc"').replace("pitch_m = 0.02\n", "")
-    (tmp_path / "large.toml").write_text(large)
-    result = tactomo("models", "draw", "large.toml", status=0)
-    assert result.stdout == "wrote small.png: small, scale 1 : 5\n"
-
-
 def test_what_cannot_be_drawn_is_told(tactomo: Run, tmp_path: Path) -> None:
     (tmp_path / "wrong.toml").write_text(SMALL.replace("pitch_m = 0.02", "pitch_m = 0.2"))
     for arguments, said in (

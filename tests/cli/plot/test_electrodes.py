@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from tactomo.cli.plot.electrodes import draw_electrodes
@@ -22,13 +21,3 @@ def test_a_pad_is_a_disc_of_its_size_with_its_number_above() -> None:
     assert (pad.get_radius(), *pad.center) == (4.0, -30.0, 20.0)
     assert axes.texts[-1].get_position() == (-30.0, 20.0 + 4.0 + GAP_MM)
     assert len(axes.lines) == len(places) - 1
-
-
-def test_numbers_stand_beside_an_insole_also_where_it_is_narrow() -> None:
-    """They were moved away from the insole's middle: at its waist, onto the rim."""
-    insole = load_description("insole")
-    axes = Figure().subplots()
-    draw_electrodes(axes, insole, GAP_MM)
-    x, y = 1e-3 * np.array([each.get_position() for each in axes.texts]).T
-    depth_mm = 1e3 * insole.sheet.outline.depth(x, y)
-    assert (depth_mm < -0.7 * GAP_MM).all()

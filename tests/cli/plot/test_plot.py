@@ -82,18 +82,6 @@ def test_scans_that_were_not_reconstructed_are_not_called_nothing_lost(tmp_path:
     assert words.endswith("0 frames lost, 39 dual scans left out")
 
 
-def test_a_pressure_between_two_unknown_ones_is_seen(tmp_path: Path) -> None:
-    def change(number: int) -> dict[str, Any]:
-        known = number == 30
-        pressure, of = (150.0, "within") if known else (None, "below")
-        contacts = [replace(c, pressure_kpa=pressure, pressure_range=of) for c in contacts_of(30)]
-        return {"contacts": [asdict(c) for c in contacts]}
-
-    axes = drawn(write_grasp(tmp_path / "a.mcap", change=change), "pressure")
-    dots = [line for line in axes.lines if line.get_marker() == "."]
-    assert [y for line in dots for y in line.get_ydata()] == [150.0]
-
-
 @pytest.mark.parametrize("what", ["pressure", "force"])
 def test_a_lower_bound_is_on_no_line(tmp_path: Path, what: str) -> None:
     def change(number: int) -> dict[str, Any]:
@@ -117,12 +105,6 @@ def test_some_panels_of_some_seconds(tactomo: Run, grasp: Path) -> None:
     assert "1 contact in 20 frames" in result.stdout
 
 
-def test_nothing_pressed_is_a_page_too(tactomo: Run, tmp_path: Path) -> None:
-    path = write_grasp(tmp_path / "idle.mcap", range(10, 18))
-    result = tactomo("plot", path, "-o", "idle.png", status=0)
-    assert "0 contacts in 8 frames" in result.stdout
-
-
 @pytest.mark.parametrize(
     ("arguments", "status", "says"),
     [
@@ -139,19 +121,6 @@ def test_what_goes_wrong_is_told(
 ) -> None:
     result = tactomo("plot", *arguments, status=status)
     assert says in result.stderr.replace("\n", " ")
-
-
-@pytest.mark.slow
-def test_a_picture_that_is_there_is_drawn_over_only_if_one_says_so(
-    tactomo: Run, grasp: Path
-) -> None:
-    page = grasp.with_name("page.png")
-    page.write_text("precious")
-    result = tactomo("plot", grasp, "-o", page, status=1)
-    assert "--force" in result.stderr
-    assert page.read_text() == "precious"
-    tactomo("plot", grasp, "-o", page, "--force", status=0)
-    assert page.read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_sensor_without_magnitude_shows_areas(grasp: Path) -> None:

@@ -14,12 +14,8 @@ from typing import IO, Any
 import pytest
 from fixture_types import Run
 from processes import children_of, is_running
-from tactomo.cli import app
 from tactomo.cli.children import Family
 from tactomo.errors import TactomoError
-from tactomo.twin import TwinConfig
-from tactomo_models import load_description
-from typer.main import get_command
 from waiting import PATIENCE_S, wait_until
 
 linux = pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks processes up in /proc")
@@ -82,18 +78,6 @@ def test_a_link_is_one_twins_as_long_as_it_lives(start: Run, tactomo: Run, tmp_p
     third = start(*command, "--announce")
     assert announced(third.stdout)["ports"] == ["dev/skin"]
     assert os.path.exists(tmp_path / "dev" / "skin")
-
-
-def test_the_twins_defaults_are_those_of_its_configuration() -> None:
-    options = {option.name: option.default for option in twin_command().params}
-    usual = TwinConfig(load_description("paper_square"))
-    assert options["rate"] == usual.rate_hz
-    assert (options["unevenness"], options["seed"]) == (usual.unevenness, usual.seed)
-    assert options["twin_control"] == usual.control
-
-
-def twin_command() -> Any:
-    return get_command(app).commands["twin"]  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(
@@ -225,10 +209,3 @@ def test_a_child_that_is_ready_ends_with_a_parent_that_is_killed() -> None:
         assert is_running(child)
         parent.kill()
     wait_until(lambda: not is_running(child))
-
-
-@pytest.mark.slow
-def test_a_verbose_family_passes_on_what_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    with Family(verbose=True) as family:
-        family.start("list", "models", "list").wait_done()
-    assert "list: paper_square" in capsys.readouterr().err

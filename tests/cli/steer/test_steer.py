@@ -103,30 +103,6 @@ def test_status_shows_what_matters(tactomo: Run, control: Any) -> None:
         assert words in result.stdout
 
 
-@pytest.mark.parametrize(
-    ("description", "words"),
-    [
-        ({"pressure_max_kpa": None}, "no magnitude channel"),
-        ({"pressure_max_kpa": 300.0, "calibration": None}, "by the description's table"),
-        (
-            {
-                "pressure_max_kpa": 250.0,
-                "calibration": {
-                    **{"taken": "2026-01-31T12:00:00+00:00", "readings": 14},
-                    **{"range_kpa": [131.2, 250.0], "sigma_kpa": 2.34},
-                },
-            },
-            "calibrated 2026-01-31 by 14 readings: 131 to 250 kPa ± 2.3",
-        ),
-    ],
-)
-def test_status_says_what_a_pressure_rests_on(
-    tactomo: Run, control: Any, description: dict[str, Any], words: str
-) -> None:
-    control.answers["status"] = {**STATUS, "description": description}
-    assert words in tactomo("status").stdout
-
-
 def test_status_begins_with_what_is_wrong_and_what_to_do(tactomo: Run, control: Any) -> None:
     closed = {"url": "/dev/ttyACM1", "connected": False, "state": "closed", "problem": "no device"}
     trouble = {"name": "port_lost", "severity": "error", "detail": "gone", "age_s": 240.0}
@@ -223,15 +199,6 @@ def test_before_the_first_tare_it_says_that_one_is_being_taken(tactomo: Run, con
     assert "tactomo tare" not in shown
 
 
-def test_status_prints_what_the_daemon_finds_and_judges_nothing_itself(
-    tactomo: Run, control: Any
-) -> None:
-    told = [{"severity": "error", "what": "it hums", "next_step": "oil it"}]
-    control.answers["status"] = {**STATUS, "state": "stale", "issues": told}
-    shown = tactomo("status").stdout
-    assert shown.splitlines()[:3] == ["it hums", "    oil it", "left_forearm: stale"]
-
-
 def test_a_status_that_no_daemon_sends_ends_in_no_traceback(tactomo: Run, control: Any) -> None:
     for key in STATUS:
         for value in (None, 7, "x", [], [1], {"a": 1}, 1e308):
@@ -241,14 +208,6 @@ def test_a_status_that_no_daemon_sends_ends_in_no_traceback(tactomo: Run, contro
     said = tactomo("status", status=1).stderr
     assert said.startswith("tactomo: what answers is no daemon of this version: ")
     assert "tactomo status --json" in said
-
-
-def test_flags_and_counts_are_told_in_words(tactomo: Run, control: Any) -> None:
-    told = {"flags": ["no_reference", "of_tomorrow"], "dropped_scans": 1, "incomplete_scans": 0}
-    control.answers["status"] = {**STATUS, **told, "frames": 1}
-    shown = tactomo("status").stdout
-    assert "no_reference: not tared yet; of_tomorrow" in shown
-    assert "1 dual scan dropped and 0 incomplete since the start, 1 frame made" in shown
 
 
 def test_every_flag_has_its_advice() -> None:
@@ -303,18 +262,6 @@ def test_a_refusal_is_one_line_with_cause_and_next_step(tactomo: Run, control: A
     )
     result = tactomo("tare", status=1)
     assert result.stderr == "tactomo: somebody presses; let go and tare again\n"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("command", [["status"], ["poke", "clear"]])
-def test_nobody_there(tactomo: Run, command: list[str]) -> None:
-    result = tactomo(*command, "--address", "ipc:///nowhere/at/all", status=1)
-    assert re.search("(nothing|no daemon) answer.* at ipc:///nowhere/at/all", result.stderr)
-
-
-def test_a_wrong_address(tactomo: Run) -> None:
-    result = tactomo("status", "--address", "here", status=1)
-    assert "tcp://127.0.0.1" in result.stderr
 
 
 def test_record_start_gives_a_name(tactomo: Run, control: Any) -> None:

@@ -151,12 +151,6 @@ def test_in_a_pipe_it_says_that_nothing_comes(tactomo: Run) -> None:
     assert "no frame of skin" in result.stderr
 
 
-@pytest.mark.slow
-def test_a_name_that_nobody_publishes_is_told(tactomo: Run, sensor: FakeSensor) -> None:
-    result = tactomo("watch", "--sensor", "other", "--address", sensor.address, status=1)
-    assert f"no daemon answers at {sensor.address} for a sensor 'other'" in result.stderr
-
-
 def test_the_picture_is_the_right_way_up() -> None:
     with FakeSensor("skin") as fake, subscribe("skin", address=fake.address) as frames:
         fake.wait_for_subscriber()
