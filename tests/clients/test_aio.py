@@ -124,21 +124,6 @@ def test_closing_ends_the_iteration_of_another_task(run: Run, sensor: FakeSensor
     run(main())
 
 
-@pytest.mark.slow
-def test_what_is_left_open_closes_itself(run: Run, pressed: FakeSensor) -> None:
-    left: list[Any] = []
-
-    async def main() -> None:
-        left.append(aio.subscribe("left", address=pressed.address))
-        await anext(left[0])
-
-    run(main())
-    socket = left[0]._connection.owner
-    left.clear()
-    gc.collect()
-    assert socket.closed
-
-
 def test_commands_of_several_tasks_are_carried_out_one_by_one(run: Run) -> None:
     answers: dict[str, Any] = {
         "tare": {"scans": 20},

@@ -7,17 +7,10 @@ import threading
 import time
 
 import pytest
-from fake_control import FakeControl
 from tactomo_client import ControlError, Daemon, MessageError, NoAnswer, request, subscribe
 from tactomo_client.control import TARE_TIMEOUT_S
 
 PATIENCE_S = 60.0
-
-
-def test_an_answer_in_another_language_is_named() -> None:
-    answers = {"status": b"HTTP/1.1 400 Bad Request\r\n\r\n"}
-    with FakeControl(answers) as web_server, pytest.raises(MessageError):
-        request("status", web_server.address, timeout_s=10)
 
 
 def test_a_wrong_address_is_named() -> None:
@@ -37,22 +30,6 @@ def test_nothing_listens_is_told_long_before_a_commands_own_time_is_over() -> No
     ):
         daemon.tare()
     assert time.monotonic() - begin_s < TARE_TIMEOUT_S / 2
-
-
-@pytest.mark.slow
-def test_a_daemon_that_starts_a_moment_later_is_reached() -> None:
-    with FakeControl() as control:
-        address = control.address
-    later: list[FakeControl] = []
-    starting = threading.Timer(
-        1.0, lambda: later.append(FakeControl({"tare": {"scans": 7}}, address))
-    )
-    starting.start()
-    try:
-        assert Daemon(address, connect_timeout_s=PATIENCE_S).tare(PATIENCE_S).scans == 7
-    finally:
-        starting.join()
-        later[0].close()
 
 
 @pytest.mark.slow

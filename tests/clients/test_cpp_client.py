@@ -228,13 +228,6 @@ def test_commands(probe: Path, start: Callable[..., DaemonProcess]) -> None:
     assert "use one of: auto" in refused.stderr
 
 
-def test_commands_to_the_twin(probe: Path, twin: Mapping[str, Any]) -> None:
-    run(probe, "control", twin["control"], "press")
-    presses = request("scene", twin["control"], PATIENCE_S)["presses"]
-    assert [(p["id"], p["x_mm"], p["y_mm"]) for p in presses] == [("probe", 20.0, -10.0)]
-    run(probe, "control", twin["control"], "clear")
-
-
 @pytest.mark.slow
 def test_nothing_answers(probe: Path) -> None:
     with FakeSensor("left") as silent:

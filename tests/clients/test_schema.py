@@ -13,17 +13,6 @@ def test_what_is_committed_is_what_the_schema_writes() -> None:
         assert path.read_text("utf-8") == text, f"{path}: run `make schema`"
 
 
-def test_a_new_field_of_a_contact_is_in_every_table_and_read_in_cpp() -> None:
-    last = "    taught: bool = False\n"
-    written = write_schema.written(
-        SOURCE.replace(last, f"{last}    hot_n: float | None = None  #: Warm\n")
-    )
-    assert "| `hot_n` | float or nil | N | 1 | Warm. |" in written[write_schema.STREAM]
-    assert "| `contact_hot_n` | float64 (C,) | N | 0.1 | Warm. |" in written[write_schema.FILES]
-    assert "std::optional<double> hot_n;" in written[write_schema.HEADER]
-    assert 'each("hot_n", fields.hot_n, Allow::both);' in written[write_schema.HEADER]
-
-
 def test_every_field_of_a_message_has_a_meaning() -> None:
     schema = write_schema.read_schema(SOURCE)
     assert tuple(row.name for row in schema["Contact"]) == wire_fields(Contact)
