@@ -56,23 +56,6 @@ def test_a_hello_with_a_rate_that_cannot_be_is_told_and_the_port_does_not_run(be
         assert "cable" not in issue["next_step"]
 
 
-@pytest.mark.slow
-def test_scans_of_another_length_are_no_waiting_for_a_trigger(bench: Start) -> None:
-    b = bench()
-    b.skin.introduce()
-    short = replace(scan(MAGNITUDE, 1), samples=np.zeros(104, np.int32))
-
-    def while_faulty() -> dict[str, Any] | None:
-        b.skin.lines[0].say(short)
-        status: dict[str, Any] = b.ask("status")
-        return status if status["ports"][0]["state"] == "faulty" else None
-
-    (issue, *_) = (i for i in b.until(while_faulty)["issues"] if "faulty" in i["what"])
-    assert "its hello says 208" in issue["what"]
-    assert "trigger" not in issue["next_step"]
-    assert "correct the firmware" in issue["next_step"]
-
-
 def test_scans_in_swapped_order_are_told(bench: Start) -> None:
     b = bench(ports=2).tare()
     first = b.skin.counter

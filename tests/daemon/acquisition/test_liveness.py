@@ -16,11 +16,6 @@ def device() -> Liveness:
     return liveness
 
 
-def test_a_device_gets_its_time_to_answer(device: Liveness) -> None:
-    assert device.judge(100.0 + PATIENCE_S - 0.1) is DeviceState.STARTING
-    assert device.judge(100.0 + PATIENCE_S) is DeviceState.SILENT
-
-
 @pytest.mark.parametrize(
     ("packets", "scans", "state"),
     [

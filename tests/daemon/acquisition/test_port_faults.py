@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import random
 import time
 from collections import Counter
@@ -15,9 +14,9 @@ import pytest
 from fixture_types import Start
 from tactomo import timing
 from tactomo.config import load_config
-from tactomo.errors import PortBusyError, PortError
+from tactomo.errors import PortError
 from tactomo.service.daemon import Daemon
-from tactomo_protocol import Acknowledge, AckStatus, Channel, CommandCode
+from tactomo_protocol import Acknowledge, AckStatus, CommandCode
 
 
 def refusal(port: str | Path) -> PortError:
@@ -108,14 +107,6 @@ def test_an_unplugged_port_is_waited_for_and_started_again(bench: Start, ports: 
     assert frame["map"] is not None
 
 
-def test_the_other_port_goes_on_while_one_is_unplugged(bench: Start) -> None:
-    b = bench(ports=2, sync_wait_ms=100).tare()
-    b.skin.line_of(Channel.STRUCTURE).unplug()
-    b.listener.event("port_lost")
-    frame = b.step(load=0.1, channels=(Channel.MAGNITUDE,))
-    assert frame["flags"] == ["structure_missing"]
-
-
 def test_a_device_that_is_there_already_needs_no_introduction(bench: Start) -> None:
     b = bench()
     line = b.skin.lines[0]
@@ -195,12 +186,6 @@ def test_a_device_in_anothers_place_and_a_command_that_it_refuses_are_told(bench
     refused = b.listener.event("command_refused")
     assert "BUSY" in refused["detail"]
     assert "PROTOCOL.md" in refused["next_step"]
-
-
-def test_a_port_that_this_process_holds_is_busy(bench: Start) -> None:
-    error = refusal(bench().skin.lines[0].path)
-    assert isinstance(error, PortBusyError)
-    assert f"pid {os.getpid()}" in error.cause
 
 
 @pytest.mark.parametrize(

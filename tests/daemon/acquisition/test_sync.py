@@ -150,50 +150,6 @@ def test_counters_that_are_zeroed_while_one_port_lags_stay_paired() -> None:
     assert sync.resets == 0
 
 
-def test_a_board_that_was_reset_alone_is_paired_only_when_both_began_anew() -> None:
-    """Its low counters are another instant's than the low ones of the zeroed pair."""
-    sync = CounterPairer(BOTH, WAIT_NS)
-    magnitude, structure = BOTH
-    minute_us = 60_000_000
-    assert feed(sync, scan(magnitude, 900, 0, minute_us), scan(structure, 900, 0, minute_us))
-    alone = feed(
-        sync,
-        scan(structure, 0, 1000, 100),  # reset
-        scan(structure, 1, 2000, 50_100),
-        scan(magnitude, 0, 3000, minute_us + 9),  # zeroed, and heard of first
-        scan(magnitude, 1, 4000, minute_us + 10),
-    )
-    assert [0, 0] not in alone
-    assert [1, 1] not in alone
-    assert (sync.resets, sync.zeroed) == (1, 1)
-    later_ns = WAIT_NS * 2
-    structure_us = [100_000 + n for n in range(9)]
-    feed(sync, scan(structure, 0, 5000, structure_us[0]))
-    pairs = [
-        feed(
-            sync,
-            scan(magnitude, n, later_ns * n, minute_us + 10 + n),
-            scan(structure, n, later_ns * n, structure_us[n]),
-        )
-        for n in range(2, 6)
-    ]
-    assert pairs[-2:] == [[[4, 4]], [[5, 5]]]
-
-
-@pytest.mark.parametrize(("start_us", "counted"), [(100, (1, 0)), (60_000_009, (0, 1))])
-def test_one_reset_of_a_device_with_two_channels_is_one(
-    start_us: int, counted: tuple[int, int]
-) -> None:
-    sync = CounterPairer(BOTH, WAIT_NS)
-    feed(sync, *(scan(channel, 900, 0, 60_000_000) for channel in BOTH))
-    feed(sync, *(scan(channel, 0, 1000, start_us) for channel in BOTH))
-    assert (sync.resets, sync.zeroed) == counted
-    feed(sync, *(scan(channel, 1, 2000, start_us + 9_000_000) for channel in BOTH))
-    again_us = start_us if counted[0] else start_us + 10_000_000
-    feed(sync, *(scan(channel, 0, 3000, again_us) for channel in BOTH))
-    assert (sync.resets, sync.zeroed) == tuple(2 * each for each in counted)
-
-
 @pytest.mark.parametrize(("old", "repeated"), [(7, 1), (6, 0)])
 def test_an_old_scan_is_no_restart_but_a_repetition_or_late(old: int, repeated: int) -> None:
     sync = CounterPairer(BOTH, WAIT_NS)
@@ -237,15 +193,3 @@ def test_a_scan_waits_for_its_partner_until_the_deadline() -> None:
     assert sync.advance(1_029) == []
     assert [dual.counter for dual in sync.advance(1_030)] == [1]
     assert sync.deadline_ns is None
-
-
-def test_a_channel_is_lost_after_several_frames_without_it() -> None:
-    second = 1_000_000_000
-    sync = CounterPairer(BOTH, wait_ns=1)
-    for channel in BOTH:
-        sync.push(scan(channel, 0, 0))
-    for missed in (1, 2, 3):  # each one longer after the last pair than a channel may be silent
-        assert sync.lost == set()
-        sync.push(scan(Channel.MAGNITUDE, missed, 2 * missed * second))
-        sync.advance((2 * missed + 1) * second)
-    assert sync.lost == {Channel.STRUCTURE}

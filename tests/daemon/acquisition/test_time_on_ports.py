@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from fixture_types import Start
 from tactomo.log import configure_logging
-from tactomo.recordings.recording import open_recording
 from tactomo.recordings.recording_writer import write_recording
 from tactomo_protocol import (
     Acknowledge,
@@ -105,32 +104,6 @@ def test_an_exact_replay_has_the_dates_and_flags_of_the_live_run(
     for counter, frame in live.items():
         assert {key: again[counter][key] for key in DATES} == {key: frame[key] for key in DATES}
     assert any(frame["delay_ns"] > 4e6 for frame in live.values())
-
-
-@pytest.mark.slow
-def test_a_recording_of_before_these_dates_replays_with_dates_of_its_own(
-    bench: Start, replay: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from dataclasses import replace
-
-    import tactomo.service.daemon as module
-    from tactomo.recordings.replay import read_replay
-
-    path = tmp_path / "live.mcap"
-    b = bench(recording={"file": path}).tare()
-    b.step()
-    b.daemon.stop()
-
-    def without_timing(*arguments: Any) -> Any:
-        found = read_replay(*arguments)
-        assert found is not None
-        return replace(found, marks=[replace(mark, timing=None) for mark in found.marks])
-
-    monkeypatch.setattr(module, "read_replay", without_timing)
-    assert all(mark.timing is not None for mark in open_recording(path).marks())
-    frames = replay(path).of("map")
-    assert len(frames) == 4
-    assert {frame["skew_ms"] for frame in frames} == {0.0}
 
 
 class Boards:

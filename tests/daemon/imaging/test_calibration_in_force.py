@@ -5,7 +5,6 @@ So it is at the daemon's start, and so when it is read again while the daemon ru
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,9 @@ import numpy as np
 import pytest
 from daemon_bench import BOTH, MEASUREMENTS, REST
 from fixture_types import Start
-from tactomo.config import load_config
 from tactomo.recordings import recorder
 from tactomo.recordings.recording import open_recording
-from tactomo.service.daemon import Daemon
-from tactomo_client import CalibrationRefused, request
+from tactomo_client import CalibrationRefused
 from tactomo_models import CalibrationError, load_description
 from tactomo_models.calibration.calibration_file import CALIBRATIONS, PressureCalibration, Subject
 from tactomo_models.calibration.curve import Reading
@@ -69,11 +66,6 @@ def test_another_sensors_is_refused_by_name(bench: Start, tmp_path: Path) -> Non
         bench(calibration=asked_for)
 
 
-def test_one_that_is_asked_for_must_be_there(bench: Start, tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match=r"there is no calibration .*absent"):
-        bench(calibration=tmp_path / "absent")
-
-
 def test_a_damaged_one_is_told_and_not_used(bench: Start) -> None:
     kept()
     path = CALIBRATIONS.path("left")
@@ -99,19 +91,6 @@ def test_another_device_is_judged_by_the_new_one(bench: Start) -> None:
     assert daemon.ask("status")["description"]["calibration"] is None
     kept(device_ids=("bench-1", "bench-2"))
     assert daemon.ask("reload_calibration")["calibration"]["readings"] == len(READINGS)
-
-
-@pytest.mark.slow
-def test_a_recording_takes_it_along(bench: Start, replay: Start, tmp_path: Path) -> None:
-    kept()
-    daemon = bench(recording={"file": tmp_path / "press.mcap"}).tare()
-    daemon.step(load=0.5)
-    daemon.ask("record_stop")
-    CALIBRATIONS.path("left").unlink()
-    recording = open_recording(tmp_path / "press.mcap")
-    assert '"pressure_kpa"' in recording.origin.calibration
-    again = open_recording(replay(recording.path).path)
-    assert again.origin == replace(recording.origin, ports=again.origin.ports)
 
 
 def test_a_new_one_is_in_force_at_once_and_one_that_was_deleted_no_more(bench: Start) -> None:
@@ -281,26 +260,6 @@ def test_files_that_were_cut_replay_by_the_calibration_of_each(
     assert heard >= 3
 
 
-@pytest.mark.slow
-def test_an_exact_replay_does_not_look_for_another(bench: Start, tmp_path: Path) -> None:
-    made = kept()
-    b = bench(recording={"file": tmp_path / "press.mcap"}).tare()
-    b.step(load=0.5)
-    b.ask("record_stop")
-    kept(factor=1.1)
-    anywhere = {"stream": "tcp://127.0.0.1:0", "control": "tcp://127.0.0.1:0"}
-    urls = open_recording(tmp_path / "press.mcap").replay_urls(0)
-    replaying = Daemon(load_config(None, name="left", ports=urls, **anywhere))
-    replaying.start()
-    try:
-        with pytest.raises(CalibrationRefused, match="tactomo replay --calibration"):
-            request("reload_calibration", replaying.control_address, 30.0)
-        description = request("status", replaying.control_address, 30.0)["description"]
-        assert description["calibration"]["range_kpa"] == list(made.curve.range_kpa)
-    finally:
-        replaying.stop()
-
-
 def taught(**changes: Any) -> TaughtSkin:
     """Keep what the skin of the bench was taught, or another one."""
     rng = np.random.default_rng(0)
@@ -324,28 +283,6 @@ def taught(**changes: Any) -> TaughtSkin:
     made = TaughtSkin(**{**fields, **changes})
     TAUGHT.save(made, TAUGHT.path("left"))
     return made
-
-
-@pytest.mark.slow
-def test_what_was_taught_is_found_by_the_sensors_name_and_told(bench: Start) -> None:
-    made = taught()
-    daemon = bench().tare()
-    told = daemon.ask("status")["description"]["taught"]
-    assert told == {
-        **{"taken": made.taken, "presses": 40},
-        **{"median_mm": 0.2, "untaught_median_mm": 1.4},
-    }
-    TAUGHT.path("left").unlink()
-    assert daemon.ask("reload_calibration")["taught"] is None
-    assert daemon.ask("status")["description"]["taught"] is None
-    again = taught(taken="2026-02-01T12:00:00+00:00")
-    assert daemon.ask("reload_calibration")["taught"]["taken"] == again.taken
-    assert (
-        "taught by 40 presses"
-        in daemon.listener.wait(
-            "event", lambda e: e["name"] == RELOADED and "taught" in e["detail"]
-        )["detail"]
-    )
 
 
 @pytest.mark.slow

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tactomo.imaging.frames import contacts_fields, description_fields, map_fields, scan_header
+from tactomo.imaging.frames import contacts_fields, description_fields, scan_header
 from tactomo.scans import ChannelScan, DualScan, Timing
-from tactomo_client.messages import array_from_wire
 from tactomo_models import Contact, Flag, Reconstruction, load_description
 from tactomo_protocol import Channel, ScanFlag
 from variants import variant
@@ -51,33 +50,6 @@ def frame(**details: Any) -> Reconstruction:
     return Reconstruction(**{**said, **details})
 
 
-def test_a_contact_is_in_millimetres_and_kilopascals() -> None:
-    fields = contacts_fields(3, frame())
-    assert fields["scan_counter"] == 3
-    [contact] = fields["contacts"]
-    expected = {
-        **{"id": 7, "x_mm": 12.0, "y_mm": -34.0, "area_mm2": 500.0, "magnitude": 0.2},
-        **{"magnitude_sigma": 0.01, "pressure_kpa": 180.0, "x_sigma_mm": 1.5, "y_sigma_mm": 2.5},
-        **{"area_sigma_mm2": 30.0, "pressure_sigma_kpa": 4.0, "force_n": 9.0, "force_sigma_n": 0.5},
-        **{"peak_kpa": 220.0, "peak_sigma_kpa": 6.0, "max_kpa": 230.0, "edge": 0.5},
-    }
-    assert {name: contact[name] for name in expected} == pytest.approx(expected)
-
-
-def test_all_contacts_together_have_a_force() -> None:
-    fields = contacts_fields(3, frame(force_n=12.5, force_sigma_n=0.5))
-    assert (fields["force_n"], fields["force_sigma_n"]) == (12.5, 0.5)
-    unknown = contacts_fields(3, frame())
-    assert unknown["force_n"] is unknown["force_sigma_n"] is None
-
-
-def test_what_is_not_known_is_nil() -> None:
-    contact = Contact(1, 0.0, 0.0, 1e-4, float("nan"), float("inf"), max_kpa=float("inf"))
-    [said] = contacts_fields(0, frame(contacts=(contact,)))["contacts"]
-    assert said["magnitude"] is said["magnitude_sigma"] is said["pressure_kpa"] is None
-    assert said["max_kpa"] is said["peak_kpa"] is said["edge"] is None
-
-
 def test_a_contact_is_where_it_is_on_the_robot() -> None:
     where: dict[str, Any] = {
         "position_m": (0.1, 0.2, 0.3),
@@ -99,24 +71,6 @@ def test_a_status_says_where_the_sheet_lies() -> None:
     x, y, z = np.array(mount["surface_m"]).T
     assert np.hypot(x, y) == pytest.approx(0.05, abs=1e-6)
     assert (z.min(), z.max()) == pytest.approx((0.125, 0.275))
-
-
-def test_a_map_has_its_ends_in_millimetres() -> None:
-    fields = map_fields(0, frame(), SENSOR)
-    assert fields["x_mm"] == pytest.approx([1e3 * SENSOR.map_x_m[0], 1e3 * SENSOR.map_x_m[-1]])
-    assert array_from_wire(fields["map"]).shape == (51, 51)
-    assert fields["structure"] is None
-
-
-def test_the_sensor_is_in_millimetres() -> None:
-    fields = description_fields(SENSOR)
-    assert (fields["width_mm"], fields["sensing_width_mm"]) == pytest.approx((150.0, 138.0))
-    assert np.ptp(np.array(fields["electrodes_mm"])[:, 0]) > 100
-    assert fields["pad_radii_mm"] == [0.0] * SENSOR.electrode_count
-    palm = load_description("palm_l")
-    places = (*(palm.electrodes.positions_m or ()), (-0.03, 0.02))
-    padded = variant(palm, electrodes={"positions_m": places, "pad_radius_m": 0.003})
-    assert description_fields(padded)["pad_radii_mm"] == [*[0.0] * (len(places) - 1), 3.0]
 
 
 def test_a_frame_was_acquired_before_its_last_byte_came() -> None:

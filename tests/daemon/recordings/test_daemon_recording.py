@@ -22,7 +22,7 @@ from tactomo.scans import Mark, ScanKey
 from tactomo.service import daemon
 from tactomo.service.daemon import Daemon
 from tactomo_client import ControlError
-from tactomo_client.messages import array_from_wire, frame_from_message
+from tactomo_client.messages import frame_from_message
 from tactomo_client.recording import open_recording as open_frames
 from tactomo_client.recording_file import intact_chunks
 from tactomo_models import Reference
@@ -33,45 +33,6 @@ def assert_same(live: dict[int, Any], again: dict[int, Any]) -> None:
     assert list(live) == list(again)
     for counter, image in live.items():
         np.testing.assert_array_equal(image, again[counter], err_msg=f"counter {counter}")
-
-
-def record_a_life(b: Any, path: Path) -> dict[int, Any]:
-    """Record presses, a lost channel, a tare and noise; return the maps published meanwhile."""
-    b.tare()
-    for _ in range(5):
-        b.step(load=0.3)  # what was before the recording must not show in the replay
-    first = b.skin.counter + 1
-    assert b.ask("record_start", path=path.name) == {"path": str(path)}
-    for index in range(10):
-        b.step(load=0.02 * index)
-    b.step(load=0.1, channels=(Channel.MAGNITUDE,))
-    b.skin.lines[0].say(b"\x00noise on the line\x00")
-    b.step(load=0.1)
-    tare_and_step(b)
-    for index in range(5):
-        b.step(load=0.01 * index)
-    last = b.skin.counter
-    result = b.ask("record_stop")
-    assert result == {"path": str(path), "bytes": path.stat().st_size}
-    b.step(load=0.5)  # and neither must what came after
-    frames = [f for f in b.listener.of("map") if first <= f["scan_counter"] <= last]
-    return maps_of(frames)
-
-
-def tare_and_step(b: Any) -> None:
-    answer = b.daemon._pipeline.tare()
-    while not answer.done():
-        b.step(load=0.05)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("ports", "speed"), [(1, 20), (2, 0)])
-def test_a_replay_gives_the_maps_of_the_live_run(
-    bench: Start, replay: Start, tmp_path: Path, ports: int, speed: float
-) -> None:
-    path = tmp_path / "life.mcap"
-    live = record_a_life(bench(ports=ports, sync_wait_ms=100), path)
-    assert_same(live, maps_of(replay(path, speed=speed).of("map")))
 
 
 @pytest.mark.slow
@@ -261,20 +222,6 @@ def imported(path: Path, reference: Reference | None = None, **hello: Any) -> li
         reference=reference,
     )
     return scans
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("speed", [0, 30])
-def test_imported_scans_are_tared_and_reconstructed_one_by_one(
-    replay: Start, tmp_path: Path, speed: float
-) -> None:
-    path = tmp_path / "two words & %.mcap"
-    imported(path)
-    again = replay(path, speed=speed, lossless=True)
-    frames = again.of("map")
-    assert [frame["scan_counter"] for frame in frames] == list(range(60))
-    assert frames[0]["flags"] == ["no_reference", "structure_missing"]
-    assert array_from_wire(frames[-1]["map"])[0, 0] == pytest.approx(0.2, rel=1e-3)
 
 
 def test_an_imported_reference_is_used_from_the_first_scan(replay: Start, tmp_path: Path) -> None:

@@ -300,21 +300,6 @@ def test_a_move_into_the_middle_of_a_packet_is_no_damage(play: Any, torn: Path) 
     assert b.ask("status")["ports"][0]["corrupt"] == 0
 
 
-def test_a_replay_sends_nobody_to_a_cable_that_is_not_there(
-    bench: Start, play: Any, tmp_path: Path
-) -> None:
-    live = bench().tare()
-    live.ask("record_start", path="noisy.mcap")
-    live.step()
-    live.skin.lines[0].say(b"\x00noise on the line\x00")
-    live.step()
-    assert "cable" in live.listener.event("corrupt_packets")["next_step"]
-    live.ask("record_stop")
-    again = play(tmp_path / "noisy.mcap")
-    again.ask("replay", paused=False)
-    assert again.listener.event("corrupt_packets")["next_step"] == "so it was recorded"
-
-
 def test_a_replay_that_loops_begins_again(play: Any, life: Life) -> None:
     path, values = life.path, life.values
     b = play(path, speed=5)

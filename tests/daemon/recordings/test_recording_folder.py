@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 
@@ -196,13 +195,3 @@ def test_links_and_folders_are_not_recordings(tmp_path: Path) -> None:
     (tmp_path / name).mkdir()
     (tmp_path / name.replace("1-", "2-")).symlink_to("/etc/hostname")
     assert list_recordings(tmp_path, "left") == []
-
-
-def test_the_names_hold_the_time_of_day_in_utc(bench: Start, tmp_path: Path) -> None:
-    b = bench(recording={"folder": tmp_path / "set"})
-    before_s = int(time.time())
-    path = Path(b.ask("record_start")["path"])
-    (found,) = list_recordings(path.parent, "left")
-    assert before_s <= found.begin_s <= time.time()
-    assert found.path == path
-    assert os.access(path, os.R_OK)

@@ -263,18 +263,6 @@ def test_a_tail_of_zeros_as_after_a_loss_of_power(tmp_path: Path, zeros: int) ->
     assert not recovery.gaps
 
 
-def test_what_lies_beyond_damage_is_told_of(tmp_path: Path) -> None:
-    data = bytearray(whole())
-    data[chunks()[5][0] + 80] ^= 1
-    path = tmp_path / "a.mcap"
-    path.write_bytes(data)
-    summary = open_recording(path).summary
-    assert (summary.is_complete, summary.has_more) == (False, True)
-    assert summary.scans[Channel.MAGNITUDE] == 5 * A_CHUNK
-    again = open_recording(recover(path, tmp_path / "b.mcap").path).summary
-    assert (again.is_complete, again.has_more, again.recovered_gaps) == (True, False, 1)
-
-
 def test_after_a_gap_marks_begin_cold_and_wait_for_their_reference(tmp_path: Path) -> None:
     data = bytearray(whole())
     middle = SCANS // 2 // A_CHUNK  # the chunk with the second reference
@@ -307,12 +295,6 @@ def test_any_byte_of_the_beginning_may_be_another(tmp_path: Path) -> None:
         assert scan_counters(output) == list(range(SCANS)), position
 
 
-def test_the_first_chunk_lost_is_no_loss_of_the_names_of_the_rest(tmp_path: Path) -> None:
-    start, end = chunks()[0]
-    data = whole()[:start] + bytes(end - start) + whole()[end:]
-    assert_honest(tmp_path, data)
-
-
 def foreign() -> bytes:
     import io
 
@@ -337,12 +319,6 @@ def test_what_is_no_recording_is_refused(tmp_path: Path, data: bytes) -> None:
             recover(tmp_path / "a.bin", tmp_path / "b.mcap")
         assert caught.value.next_step
         assert [path.name for path in tmp_path.iterdir()] == ["a.bin"]
-
-
-def test_folders_and_absent_files_are_refused(tmp_path: Path) -> None:
-    for path in (tmp_path, tmp_path / "none.mcap"):
-        with pytest.raises(RecordingError, match="cannot open"):
-            recover(path, tmp_path / "b.mcap")
 
 
 def test_nothing_is_written_over(tmp_path: Path) -> None:

@@ -63,22 +63,6 @@ def test_a_bad_file_is_refused_with_the_reason(tmp_path: Path, text: str, said: 
     assert caught.value.next_step
 
 
-@pytest.mark.parametrize(
-    ("text", "next_step"),
-    [
-        ("prot = 1", "known keys: name, "),
-        ("[recording]\nrotat_mb = 1", "known keys: file, "),
-        ("tare_scans = 1", "tactomo service example"),
-    ],
-)
-def test_the_keys_that_there_are_are_told_where_one_is_not(
-    tmp_path: Path, text: str, next_step: str
-) -> None:
-    with pytest.raises(ConfigError) as caught:
-        load_config(config_file(tmp_path, f"ports = ['a']\n{text}"))
-    assert next_step in caught.value.next_step
-
-
 def test_ports_may_be_given_in_both_ways(tmp_path: Path) -> None:
     for path in (None, config_file(tmp_path, "name = 'left'")):
         with pytest.raises(ConfigError, match="ports is missing") as caught:

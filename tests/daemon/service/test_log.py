@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -103,26 +103,6 @@ def daemon(*arguments: str, **environment: str) -> subprocess.Popen[str]:
         os.close(writer)
     process.stderr = os.fdopen(reader)
     return process
-
-
-@pytest.mark.slow
-def test_under_journald_a_failure_to_start_is_an_error(
-    tmp_path: Path, make_skin: Callable[[Path, int], Any], used_port: int
-) -> None:
-    metrics = f"metrics=127.0.0.1:{used_port}"
-    with daemon("--port", str(make_skin(tmp_path, 1).lines[0].path), "--set", metrics) as process:
-        assert process.stderr is not None
-        said = process.stderr.read()
-    assert process.returncode == 1
-    assert "<6>loading sensor_model=paper_square" in said
-    assert re.search(rf"^<3>tactomo: .*{used_port}", said, re.M)
-
-
-@pytest.fixture
-def used_port() -> Iterator[int]:
-    """A TCP port of this computer that somebody listens at."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        yield int(server.getsockname()[1])
 
 
 @pytest.mark.slow

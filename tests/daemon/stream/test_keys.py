@@ -17,7 +17,6 @@ import pytest
 import zmq
 from fixture_types import Start
 from page import Page
-from tactomo.cli.calibrate import calibrate
 from tactomo.config import load_config
 from tactomo.endpoint import bind
 from tactomo.errors import AddressError, ConfigError
@@ -39,13 +38,6 @@ from tactomo_client import (
 )
 from tactomo_client import Daemon as Commander
 from tactomo_client.keys import read_public, read_secret
-from tactomo_models import load_description
-from tactomo_models.calibration.calibration_file import (
-    CALIBRATIONS,
-    PressureCalibration,
-    subject_of,
-)
-from tactomo_models.calibration.curve import Reading
 from tactomo_viewer.browser import Feed
 from waiting import PATIENCE_S, wait_until
 
@@ -235,23 +227,6 @@ def test_a_reader_may_not_command_and_another_servers_key_is_noticed(
     with pytest.raises(KeysError) as caught:
         request("status", guarded.daemon.control_address, PATIENCE_S, keys=misled)
     assert caught.value.name == "wrong_server"
-
-
-def test_a_reader_is_told_who_can_put_a_calibration_in_force(
-    guarded: Any, robot: Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(calibrate, "CONNECT_S", PATIENCE_S)
-    sensor = load_description("paper_square")
-    readings = [Reading(pressure_kpa=k, magnitude=(k - 140) * 2e-3) for k in range(150, 241, 10)]
-    made = PressureCalibration.of_readings(subject_of("left", sensor), readings)
-    path = CALIBRATIONS.path("left")
-    reader = robot.allow(robot.client("reader"))
-    told = calibrate.taken_up(CALIBRATIONS, made, path, guarded.daemon.stream_address, reader)
-    assert told.startswith("not in force yet: ")
-    assert "calibrate reload --sensor left" in told
-    commander = robot.allow(robot.client("chief"), may_command=True)
-    told = calibrate.taken_up(CALIBRATIONS, made, path, guarded.daemon.stream_address, commander)
-    assert "the description's table" in told
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,6 @@ from tactomo.errors import CommandError
 from tactomo.service import metrics
 from tactomo_client.schema import EVENTS, TOUCHES_SEEN
 from tactomo_models import Flag
-from tactomo_models.methods.auto import UNSURE_MISFIT
-from tactomo_models.methods.magnitudes import BAD_MISFIT
-from tactomo_models.methods.registry import METHODS
 
 DOCUMENT_FOLDER = Path(__file__).parents[3] / "clients"
 DOCUMENT = (DOCUMENT_FOLDER / "STREAM.md").read_text("utf-8")
@@ -39,25 +36,6 @@ def of_status(heading: str) -> dict[str, str]:
     """Return the meaning of each row of a table of the document."""
     rows = cells_of("clients/STREAM.md", heading)
     return {name: row["Meaning"] for name, row in rows.items()}
-
-
-NAMED_BY_THEMSELVES = ("stage_ms", "scans")
-"""Maps whose keys are the names of stages, or of channels."""
-
-
-@pytest.mark.slow
-def test_every_name_inside_a_status_is_told(bench: Callable[..., Any]) -> None:
-    """A message's own fields are held against their tables by `stream_rules`."""
-    daemon = bench(ports=1).tare()
-    daemon.step(load=0.5)
-    status = daemon.listener.wait("status", lambda s: s["ports"][0]["device"] and s["reference"])
-    assert daemon.listener.of("map")[-1]["map"].keys() == table("### Arrays")
-    assert daemon.ask("status").keys() == status.keys()
-    rows = of_status("### `status`") | of_status("Each of `ports`:")
-    for name, inside in [*status.items(), *status["ports"][0].items()]:
-        if isinstance(inside, dict) and name not in ("description", *NAMED_BY_THEMSELVES):
-            told = set(re.findall(r"`(\w+)`", rows[name]))
-            assert inside.keys() <= told, name
 
 
 def test_every_flag_is_explained() -> None:
@@ -80,22 +58,6 @@ def test_the_clients_know_of_which_flags_touches_are_seen() -> None:
 def test_every_state_is_listed_and_scraped() -> None:
     told = re.findall(r"`(\w+)`", of_status("### `status`")["state"])
     assert tuple(told) == metrics.STATES
-
-
-def test_every_method_is_listed_that_may_have_made_a_frame() -> None:
-    row = re.search(r"^\| `tier` \|.*?The method that made the frame: (.*)\|", DOCUMENT, re.M)
-    assert row
-    listed = set(re.findall(r"`(\S+)`", row[1]))
-    old = {"hybrid"}
-    asked_for = {"auto"}  # and one of the others then makes the frame
-    assert listed == {"quiet", *METHODS} - asked_for | old
-
-
-def test_it_says_from_what_misfit_on_a_frame_is_flagged() -> None:
-    row = re.search(r"^\| `misfit` .*", DOCUMENT, re.M)
-    assert row
-    assert f"Above {BAD_MISFIT:g} the frame" in row[0]
-    assert f"Above {UNSURE_MISFIT:g} over both" in row[0]
 
 
 def test_every_event_is_listed_and_told() -> None:
