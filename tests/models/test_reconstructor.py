@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import astuple, replace
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -69,16 +68,6 @@ def test_one_press_is_found_with_its_pressure(
     assert np.unravel_index(frame.map.argmax(), frame.map.shape) == pytest.approx(
         (25 + place[1] / 3, 25 + place[0] / 3), abs=4.5
     )
-
-
-def test_several_presses_stay_separate(reconstructor: Reconstructor, skin: Skin) -> None:
-    presses = [press_mm(-35, 30, 150), press_mm(30, -30, 190), press_mm(35, 35, 170)]
-    frame = settle(reconstructor, skin, *presses, frames=20)
-    assert len(frame.contacts) == 3
-    for press in presses:
-        contact = nearest(frame, press)
-        assert error_mm(contact, press) < 2
-        assert contact.pressure_kpa == pytest.approx(press.pressure_kpa, abs=20)
 
 
 def test_what_lands_beside_a_level_set_is_found_from_nothing(
@@ -408,18 +397,3 @@ def test_an_insulating_object_in_a_disc_is_found() -> None:
     (contact,) = frame.contacts
     assert error_mm(contact, cup) < 3
     assert frame.map is None, "a single channel that saturates has no magnitude"
-
-
-@pytest.mark.parametrize("shape", ["ring", "ellipse"])
-def test_a_ring_is_told_from_a_disc_by_the_magnitude_channel(
-    reconstructor: Reconstructor, skin: Skin, shape: Literal["ring", "ellipse"]
-) -> None:
-    """What is inside a saturated contact is hidden from the structure channel alone."""
-    press = Press(0.035, -0.03, 190, 0.02, shape=shape)
-    frame = settle(reconstructor, skin, press)
-    (contact,) = frame.contacts
-    assert contact.pressure_kpa == pytest.approx(190, abs=10)
-    full = math.pi * press.radius_m**2
-    assert contact.area_m2 == pytest.approx(0.75 * full if shape == "ring" else full, rel=0.1)
-    assert frame.map is not None
-    assert (frame.map[15, 37] < 0.05 * contact.magnitude) == (shape == "ring")

@@ -256,10 +256,3 @@ def test_a_pipe_in_a_calibrations_place_is_refused_and_not_waited_for(tmp_path: 
     os.mkfifo(tmp_path / "left.pressure.json")
     with pytest.raises(CalibrationError, match="no regular file"):
         CALIBRATIONS.read(tmp_path / "left.pressure.json")
-
-
-def test_foreign_devices_are_named(subject: Subject) -> None:
-    ours = subject.model_copy(update={"device_ids": ("skin-a", "skin-b")})
-    assert ours.foreign({"skin-a"}) == ""
-    assert subject.foreign({"skin-c"}) == ""
-    assert ours.foreign({"skin-a", "skin-c"}).endswith("and skin-c is connected")

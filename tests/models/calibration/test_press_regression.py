@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from drawn_skin import presses_on
 from tactomo_models.calibration.press_regression import PressRegression
-from tactomo_models.errors import DataError
 
 
 @pytest.fixture(scope="module")
@@ -38,15 +37,6 @@ def test_strength_and_units_of_volts_do_not_matter() -> None:
     np.testing.assert_allclose(a.xy_mm, b.xy_mm, atol=1e-6)
 
 
-def test_what_was_not_taught_is_told() -> None:
-    """Taught on the left half, pressed on the right one, farther than a neighbour reaches."""
-    learnt = PressRegression(*presses_on(1, 200, half=True))
-    changes, xy_mm = presses_on(2, 400)
-    is_taught = learnt.locate(changes).is_taught
-    assert is_taught[xy_mm[:, 0] < 0].mean() > 0.95
-    assert is_taught[xy_mm[:, 0] > 15].mean() < 0.1
-
-
 def test_what_a_model_gets_wrong_is_learnt() -> None:
     """A model that is 4 mm off to one side, and squeezed: from 20 presses on."""
     changes, xy_mm = presses_on(1, 100)
@@ -61,18 +51,3 @@ def test_what_a_model_gets_wrong_is_learnt() -> None:
     found = learnt.locate(new, guess)
     assert np.median(np.linalg.norm(guess - there_mm, axis=1)) > 3
     assert np.median(np.linalg.norm(found.xy_mm - there_mm, axis=1)) < 0.8
-
-
-def test_presses_that_teach_nothing_are_refused() -> None:
-    changes, xy_mm = presses_on(1, 30)
-    with pytest.raises(DataError, match="11 presses are too few"):
-        PressRegression(changes[:11], xy_mm[:11])
-    changes[7] = 0.0
-    with pytest.raises(DataError, match="press 7 changes no voltage"):
-        PressRegression(changes, xy_mm)
-    changes[7], changes[9, 3] = changes[8], np.nan
-    with pytest.raises(DataError, match="press 9"):
-        PressRegression(changes, xy_mm)
-    changes[9] = changes[8]
-    with pytest.raises(DataError, match="one place"):
-        PressRegression(changes, np.zeros((30, 2)))

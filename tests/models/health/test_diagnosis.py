@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import shared_data
 from faulty_skin import BAD_LEADS, rewired, shorted, touches
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,10 +11,9 @@ from noisy_skin import rms
 from tactomo_models import Artifact, DataError, Press, SensorDescription, SkinSimulator
 from tactomo_models.arrays import FloatArray
 from tactomo_models.health.diagnosis import Diagnosis, diagnose
-from tactomo_models.health.examination import noise_about_line
 from tactomo_models.health.findings import Finding, Level
 from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
-from tactomo_models.sensor.pattern import PatternLayout, scan_pairs
+from tactomo_models.sensor.pattern import scan_pairs
 from tactomo_protocol import Channel
 
 SCANS = 60
@@ -199,15 +197,6 @@ def test_one_scan_is_enough_for_reciprocity_and_none_is_not(patient: Patient) ->
         patient.examine(np.ones((3, 200)))
 
 
-def test_voltages_in_no_order_are_broken(patient: Patient) -> None:
-    mixed = np.random.default_rng(0).permutation(patient.rest())
-    found = patient.examine(patient.scans(mixed), has_model=False)
-    assert found.level == Level.BROKEN
-    reciprocity = about(found, "reciprocity")
-    assert reciprocity.level == Level.BROKEN
-    assert "nothing can be located" in reciprocity.next_step
-
-
 @given(
     electrodes=st.integers(8, 24),
     drive=st.integers(1, 4),
@@ -221,36 +210,3 @@ def test_a_pattern_is_read_off_its_zeros(electrodes: int, drive: int, measure: i
     found = fitting_patterns(scans)
     if (drive, measure) == (1, 1) or electrodes >= 13 or found:
         assert found == [NamedPattern(electrodes, drive, measure)]
-
-
-def test_noise_is_not_drift() -> None:
-    rng = np.random.default_rng(0)
-    noise = rng.standard_normal((2000, 3))
-    drift = np.arange(2000)[:, None] * [0.0, 1.0, -10.0]
-    np.testing.assert_allclose(noise_about_line(100 + noise + drift), 1.0, rtol=0.1)
-    assert not noise_about_line(noise[:2]).any()
-
-
-def test_the_broken_device_is_broken() -> None:
-    with np.load(shared_data.measured("skin_bad_device_32el.npz")) as file:
-        scans = file["baseline"].astype(float)
-    [named] = fitting_patterns(scans)
-    assert str(named) == "32:adjacent"
-    layout = named.layout
-    pairs = layout.pairs
-    found = diagnose(layout, scans[:, pairs.drive[:, 0] * 32 + pairs.measure[:, 0]])
-    assert found.level == Level.BROKEN
-    assert about(found, "reciprocity").figures["pairs_percent"] == pytest.approx(68, abs=0.5)
-
-
-def test_the_tank_is_healthy() -> None:
-    with np.load(shared_data.measured("tank_sciospec_20fps.npz")) as file:
-        volts = file["volts"][:20].real
-    pairs = scan_pairs(16)
-    scans = volts[:, pairs.drive[:, 0], pairs.measure[:, 0]]
-    scans = scans - volts[:, pairs.drive[:, 0], pairs.measure[:, 1]]
-    found = diagnose(PatternLayout(pairs, 16), scans)
-    assert found.level == Level.OK
-    assert not ill(found)
-    assert about(found, "snr").figures["snr_db"] == pytest.approx(57.7, abs=0.3)
-    assert about(found, "reciprocity").figures["together_percent"] == pytest.approx(2.5, abs=0.1)

@@ -167,19 +167,6 @@ def test_a_budget_that_is_too_small_is_said_and_made_up_for(
     assert len(made[-1].contacts) == 2
 
 
-def test_the_linear_tier_serves_when_it_is_asked_for(
-    reconstructor: Reconstructor, skin: Skin
-) -> None:
-    reconstructor.method = "tikhonov"
-    (frame,) = frames(reconstructor, skin, PRESS, count=1)
-    assert frame.tier == "tikhonov"
-    assert frame.pressure_kpa is None, "a linear image pales: no pressure follows from it"
-    assert frame.structure is not None
-    assert 0 <= frame.structure.min() < frame.structure.max() <= 1
-    (contact,) = frame.contacts
-    assert math.dist((contact.x_m, contact.y_m), (PRESS.x_m, PRESS.y_m)) < 0.01
-
-
 def test_the_linear_map_is_linear(
     reconstructor: Reconstructor, skin: Skin, rest: Reference
 ) -> None:

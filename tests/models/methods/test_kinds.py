@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pressed import contact, contacts
 from tactomo_models.arrays import FloatArray
 from tactomo_models.methods.kinds import SHARES, Kind, as_kind, as_one, kind_of, log_prior
-from tactomo_models.scene.parameters import COLUMNS, E1, E2, PEAK, SIZE, UNIT_M, X, Y
+from tactomo_models.scene.parameters import E1, E2, PEAK, SIZE, UNIT_M, X, Y
 
 ONE = [Kind.EVEN, Kind.ROUNDED, Kind.RING, Kind.FALLING]
 places = st.floats(-0.05, 0.05)
@@ -103,10 +103,6 @@ def test_contacts_of_a_scene_are_more_often_alike(kinds: list[Kind], random: Ran
     assert log_prior(again) == pytest.approx(log_prior(kinds))
 
 
-def test_nothing_is_no_contact() -> None:
-    assert as_kind(contact(), Kind.NONE).shape == (0, COLUMNS)
-
-
 @given(st.lists(st.tuples(places, places, radii, elongations, angles), min_size=1, max_size=5))
 def test_several_as_one_keep_centre_and_moments(
     each: list[tuple[float, float, float, float, float]],
@@ -118,11 +114,3 @@ def test_several_as_one_keep_centre_and_moments(
     assert own_centre == pytest.approx(centre, abs=1e-9)
     np.testing.assert_allclose(own, second, rtol=1e-6, atol=1e-12)
     assert one[PEAK] == pytest.approx(0.7 * min(area / own_area, 1.0))  # the same force
-
-
-@given(places, places, radii, elongations, angles)
-def test_one_as_one_is_itself(
-    x: float, y: float, radius: float, elongation: float, angle: float
-) -> None:
-    own = drawn(x, y, radius, elongation, angle)
-    assert as_one(own[None]) == pytest.approx(own, abs=1e-6)

@@ -119,12 +119,6 @@ def test_an_outline_that_the_mesh_has_bent_is_seldom_surely_another(
     assert np.count_nonzero(are_bent) <= 1
 
 
-def test_nothing_is_no_contact(skin: Skin) -> None:
-    belief = Search(skin.sensor.fit).advance(None, skin.frame())
-    assert_at(belief)
-    assert belief.how == "cold start"
-
-
 def test_contacts_are_found_from_nothing(skin: Skin) -> None:
     assert_at(Search(skin.sensor.fit).advance(None, skin.frame(LEFT, RIGHT)), LEFT, RIGHT)
 
@@ -189,14 +183,6 @@ def test_a_contact_that_slides_is_followed(skin: Skin, solves: list[int]) -> Non
     assert np.median(spent[3:]) <= 3
 
 
-def test_contacts_that_land_lift_and_jump_are_told_at_once(skin: Skin) -> None:
-    search, belief = Search(skin.sensor.fit), None
-    jumped = contact(0.006, -0.012, 0.007)
-    for each in ((LEFT,), (LEFT, RIGHT), (RIGHT,), (jumped,), (LEFT, RIGHT), ()):
-        belief = search.advance(belief, skin.frame(*each))
-        assert_at(belief, *each)
-
-
 def test_a_contact_that_leaves_the_sheet_is_one_until_it_is_gone(stacked: Skin) -> None:
     search, belief = Search(stacked.sensor.fit), None
     for x_m in (0.050, 0.055, 0.060, 0.065, 0.070):
@@ -204,27 +190,6 @@ def test_a_contact_that_leaves_the_sheet_is_one_until_it_is_gone(stacked: Skin) 
         assert belief.account.family.count == 1
         assert np.isfinite(belief.account.contacts).all()
     assert_at(search.advance(belief, stacked.frame()))
-
-
-def test_a_sheet_that_is_lost_and_comes_back_changes_no_contact(
-    forward: ForwardModel, small: SensorDescription
-) -> None:
-    """The magnitude channel misses frames: outlines go on, and pressures come back."""
-    skin = Skin(Sensor.of(forward, described(small, "both")), np.random.default_rng(2))
-    search = Search(skin.sensor.fit)
-    before = belief = search.advance(None, skin.frame(LEFT, RIGHT))
-    for lost in (1, 10):
-        for _ in range(lost):
-            structure = skin.measured(LEFT, RIGHT)[Channel.STRUCTURE]
-            belief = search.advance(belief, Frame({Channel.STRUCTURE: structure}, Budget(PLENTY_S)))
-            assert_at(belief, LEFT, RIGHT)
-        belief = search.advance(belief, skin.frame(LEFT, RIGHT))
-        assert_at(belief, LEFT, RIGHT)
-        found, then = (
-            each.account.contacts[each.account.contacts[:, X].argsort()]
-            for each in (belief, before)
-        )
-        np.testing.assert_allclose(found, then, atol=0.1)
 
 
 # One call
@@ -278,18 +243,6 @@ def test_a_step_is_a_pure_function(skin: Skin, change: str) -> None:
     other = search.advance(belief, Frame(measured, Budget(PLENTY_S)))
     assert same(said(belief), before)
     assert same(said(one), said(other))
-
-
-def test_work_that_a_budget_cuts_short_goes_on_in_the_next_frames(skin: Skin) -> None:
-    """And ends at about the belief of a frame that took its time."""
-    search, measured = Search(skin.sensor.fit), skin.measured(LEFT, RIGHT)
-    frames = (Frame(measured, Budget(1e-3)) for _ in range(300))
-    assert not followed(search, [next(frames)]).done
-    belief = followed(search, frames)
-    assert_at(belief, LEFT, RIGHT)
-    at_once = search.advance(None, Frame(measured, Budget(PLENTY_S)))
-    assert belief.account.log_evidence == pytest.approx(at_once.account.log_evidence, abs=0.5)
-    assert kinds_by_x(belief) == kinds_by_x(at_once)
 
 
 def test_pressures_follow_what_moves_also_when_time_is_short(skin: Skin) -> None:

@@ -10,26 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_sensor import SMALL
 from tactomo_models import DescriptionError, SensorDescription, load_description
-from tactomo_models.sensor.description_file import shipped_descriptions, shipped_text
+from tactomo_models.sensor.description_file import shipped_text
 from tactomo_models.sensor.pattern import scan_pairs
 from variants import variant
-
-
-@pytest.mark.parametrize("name", shipped_descriptions())
-def test_shipped_descriptions_load(name: str) -> None:
-    assert load_description(name).name == name
-
-
-def test_the_paper_sensor_is_the_one_of_the_paper(paper: SensorDescription) -> None:
-    assert paper.measurements == 208
-    assert paper.electrode_count == 16
-    assert (len(paper.map_x_m), len(paper.map_y_m)) == (51, 51)
-    centres_mm = (paper.electrode_centres_m * 1e3).round(6).tolist()
-    # Electrode 0 is the left one of the bottom side; counter-clockwise from there.
-    assert centres_mm[0] == [-54, -75]
-    assert centres_mm[3:5] == [[54, -75], [75, -54]]
-    assert centres_mm[8] == [54, 75]
-    assert centres_mm[15] == [-75, -54]
 
 
 def structure_table(ratios: str) -> str:
