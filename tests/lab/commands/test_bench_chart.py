@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 
 import pytest
 from fixture_types import Run
-from matplotlib.text import Text
 from tactomo_lab.commands import chart as bench_chart
-from tactomo_lab.commands.chart import Point, draw_chart
+from tactomo_lab.commands.chart import Point
 from tactomo_lab.evaluation.play import Variant
 from tactomo_lab.scenes.measures import summarise
 from tactomo_models import available_methods
@@ -40,40 +38,6 @@ def test_the_rows_tell_what_is_on_the_front() -> None:
     assert [row["on_front"] for row in rows] == [True, True, False]
 
 
-def test_the_picture_names_every_method_and_budget() -> None:
-    twins = [point(method, 0.02, 0.9) for method in available_methods()]
-    budgets = [point("auto", 0.1, icc, budget_s=icc / 10) for icc in (0.1, 0.11, 0.3, 1.0)]
-    impossible = [point("noser", 0.1, icc) for icc in (-0.2, float("nan"))]
-    figure = draw_chart([*twins, *budgets, *impossible], "a title")
-    (legend,) = figure.legends
-    told = {text.get_text() for text in legend.get_texts()}
-    assert {*available_methods(), "10 ms", "11 ms", "30 ms", "100 ms"} <= told
-    assert figure.get_suptitle() == "a title"
-
-
-def test_the_more_work_a_budget_allows_the_larger_is_its_marker() -> None:
-    points = [point("auto", 0.01, 0.9, budget_s=ms / 1e3) for ms in (20, 1, 5)]
-    (axes,) = draw_chart(points, "a title").axes
-    unhurried, hasty, usual = (bar[0].get_markersize() for bar in axes.containers)
-    assert hasty < usual < unhurried
-
-
-def test_no_two_words_overlap() -> None:
-    points = [
-        point(method, 0.01 * (1 + step / 20), 0.9 - step / 1000, budget_s=ms / 1e3)
-        for method in available_methods()
-        for step, ms in enumerate((5, 20, 50))
-    ]
-    moving = [replace(point, scene="moving") for point in points]
-    figure = draw_chart([*points, *moving], "a title\nof two lines")
-    figure.draw_without_rendering()
-    words = [text for text in figure.findobj(Text) if text.get_text().strip("-.0123456789")]
-    boxes = {text.get_text(): text.get_window_extent() for text in words}
-    assert len(boxes) > len(available_methods()) + 3
-    pairs = combinations(boxes.items(), 2)
-    assert [(one, other) for (one, a), (other, b) in pairs if a.overlaps(b)] == []
-
-
 def test_a_busy_machine_is_told_in_the_picture(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -83,16 +47,6 @@ def test_a_busy_machine_is_told_in_the_picture(
     monkeypatch.setattr(bench_chart, "save_figure", lambda figure, _: drawn.append(figure))
     bench_chart.chart("paper_square", tmp_path / "chart.png", 1, "a machine")
     assert "a machine; the machine was busy" in drawn[0].get_suptitle()  # type: ignore[attr-defined]
-
-
-def test_no_two_methods_look_alike() -> None:
-    figure = draw_chart([point(method, 0.02, 0.9) for method in available_methods()], "a title")
-    (axes,) = figure.axes
-    looks = {(bar[0].get_marker(), bar[0].get_color()) for bar in axes.containers}
-    assert len(looks) == len(available_methods())
-    assert (
-        len({marker for marker, _ in looks}) == len({colour for _, colour in looks}) == len(looks)
-    )
 
 
 def test_what_cannot_be_written_is_refused_before_the_work(

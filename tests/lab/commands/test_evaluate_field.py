@@ -33,17 +33,6 @@ def test_in_numbers_words_and_a_picture(field: Run, tmp_path: Path) -> None:
     assert "area in σ" in words.stdout
 
 
-@pytest.mark.parametrize(
-    ("picture", "told"),
-    [("field.txt", "not a kind of picture"), ("nowhere/field.png", "there is no folder nowhere")],
-)
-def test_a_picture_that_cannot_be_is_told_before_the_work(
-    tactomo: Run, picture: str, told: str
-) -> None:
-    result = tactomo("evaluate", "field", "--count", 1, "--picture", picture, status=1)
-    assert told in result.stderr
-
-
 @pytest.mark.slow
 def test_regimes_in_numbers_words_and_a_picture(field: Run, tmp_path: Path) -> None:
     picture = tmp_path / "flags.png"

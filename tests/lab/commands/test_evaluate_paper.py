@@ -30,15 +30,6 @@ def test_in_numbers(tactomo: Run, few: tuple[object, ...]) -> None:
 
 
 @pytest.mark.slow
-def test_in_words(tactomo: Run, few: tuple[object, ...]) -> None:
-    result = tactomo(*few, "--figure", "10", "--method", "tikhonov", status=0)
-    assert "Ours are simulated, not measured: small, tuning seeds" in result.stdout
-    for words in ("7.7 ± 6.6", "paper, hardware", "ours, simulated"):
-        assert words in result.stdout
-    assert "Fig. 5" not in result.stdout
-
-
-@pytest.mark.slow
 def test_a_method_that_cannot_be_had_is_said_and_left_out(
     tactomo: Run, few: tuple[object, ...]
 ) -> None:

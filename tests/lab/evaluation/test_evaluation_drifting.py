@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from tactomo_lab.evaluation.drifting import draw_day
-from tactomo_lab.evaluation.field import cases_of_row
 from tactomo_lab.evaluation.play import play
 from tactomo_lab.scenes.case import Case
 from tactomo_lab.scenes.measures import Summary, summarise
@@ -40,15 +39,3 @@ def test_a_day_of_drift_leaves_no_ghost_and_erases_nothing(paper: SensorDescript
     assert bare.warned > 0.3
     assert followed.warned < 0.01
     assert bare.magnitude_error > followed.magnitude_error
-
-
-def test_days_are_followed_and_not(
-    paper: SensorDescription, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ways: list[bool] = []
-    monkeypatch.setattr(
-        "tactomo_lab.evaluation.field.draw_day", lambda *_, is_followed: ways.append(is_followed)
-    )
-    lines = cases_of_row(paper, "day", "tuning", 20)
-    assert [len(list(cases)) for cases in lines.values()] == [2, 2]
-    assert ways == [True, True, False, False]

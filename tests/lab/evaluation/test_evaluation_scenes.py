@@ -25,13 +25,11 @@ from tactomo_lab.scenes.simulation import (
     fine_mesh,
     truth_of,
     with_contrast,
-    with_opposite_magnitude,
 )
 from tactomo_models import DataError, Press, SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
 from tactomo_protocol import Channel
-from variants import variant
 
 presses = st.builds(
     Press,
@@ -116,22 +114,6 @@ def test_a_light_press_is_pressed_in_part_and_has_no_magnitude(paper: SensorDesc
     assert firm.map.max() == pytest.approx(0.03 + 0.22 / 6)
 
 
-def test_variants_of_a_sensor(paper: SensorDescription, small: SensorDescription) -> None:
-    assert paper.magnitude
-    assert small.structure
-    turned = with_opposite_magnitude(paper)
-    assert turned.magnitude
-    assert turned.magnitude.response.sign == -paper.magnitude.response.sign
-    assert turned.sha256 == paper.sha256  # the same artifact serves
-    for sensor in (paper, small):
-        channel = with_contrast(sensor, 20.0).structure
-        assert channel
-        assert channel.saturated_ratio == pytest.approx(20)
-    insulating = variant(small, structure={"conductivity_ratio": 0.01})
-    assert (channel := with_contrast(insulating, 20.0).structure)
-    assert channel.saturated_ratio == pytest.approx(1 / 20)
-
-
 @pytest.mark.slow
 def test_the_simulation_converges(paper: SensorDescription) -> None:
     """Voltage changes are right to about a percent: a mesh with other nodes says the same."""
@@ -145,15 +127,6 @@ def test_the_simulation_converges(paper: SensorDescription) -> None:
         changes.append([pressed[name] - rest[name] for name in BOTH_CHANNELS])
     for coarse, fine, limit in zip(*changes, (0.003, 0.015), strict=True):
         assert 1e-6 < np.linalg.norm(coarse - fine) / np.linalg.norm(fine) < limit
-
-
-def test_every_sheet_is_uneven_in_its_own_way(paper: SensorDescription, mesh: SheetMesh) -> None:
-    first, again, other = (
-        UnevenSkin(paper, mesh, np.random.SeedSequence(seed)).voltages([]) for seed in (5, 5, 6)
-    )
-    np.testing.assert_array_equal(first[Channel.STRUCTURE], again[Channel.STRUCTURE])
-    for sheet in (first[Channel.MAGNITUDE], other[Channel.STRUCTURE]):
-        assert 0.01 < np.std(sheet / first[Channel.STRUCTURE]) < 0.2
 
 
 def one(paper: SensorDescription, snr_db: float = 40, snr_of: SnrOf = "change") -> Case:

@@ -9,7 +9,7 @@ from tactomo_lab.evaluation.field import (
     cases_of_row,
     frames_of_row,
 )
-from tactomo_lab.evaluation.moving import NOISE_DB, draw_sequence, mixed_sequence
+from tactomo_lab.evaluation.moving import draw_sequence
 from tactomo_lab.evaluation.play import play
 from tactomo_lab.evaluation.regimes import make_case
 from tactomo_lab.scenes.case import Case
@@ -99,12 +99,3 @@ def test_a_ball_has_its_peak_and_the_mean_over_its_area(small: SensorDescription
     cell_m2 = np.diff(small.map_x_m)[0] * np.diff(small.map_y_m)[0]
     in_all = scene.truth.map.sum() * cell_m2
     assert contact.magnitude * contact.area_m2 == pytest.approx(in_all, rel=1e-6)
-
-
-@pytest.mark.slow
-def test_mixed_moving_presses_are_scored_at_both_noises(small: SensorDescription) -> None:
-    lines = frames_of_row(small, "mixed-moving", "tikhonov", "tuning", 1)
-    assert list(lines) == [f"mixed-moving, noise of {of}" for of in ("each change", "voltage")]
-    for noise_of, outcomes in zip(NOISE_DB, lines.values(), strict=True):
-        frames = mixed_sequence(small, "tuning", 0, noise_of).frames
-        assert [outcome.frame.presses for outcome in outcomes] == [f.presses for f in frames]

@@ -18,7 +18,6 @@ from tactomo_lab.scenes.simulation import (
     UnevenSkin,
     displaced,
     fine_mesh,
-    with_opposite_magnitude,
 )
 from tactomo_models import Reconstructor, SensorDescription
 from tactomo_models.arrays import FloatArray
@@ -125,14 +124,6 @@ def test_a_lead_opens_on_one_sheet_in_the_last_frame(small: SensorDescription) -
     assert change(last[good], before[good]) < 1e-2
     driven = (small.pairs.drive == case.plan.lead.electrode).any(axis=1)
     assert np.abs(last[broken][driven]).max() < 0.1 * np.abs(before[broken][driven]).max()
-
-
-def test_the_wrong_sign_is_told(small: SensorDescription) -> None:
-    case = case_of(small, "wrong-sign")
-    true = with_opposite_magnitude(small) if case.plan.opposite else small
-    assert case.description.magnitude
-    assert true.magnitude
-    assert case.description.magnitude.response.sign == -true.magnitude.response.sign
 
 
 def test_states_of_a_sheet(small: SensorDescription) -> None:
