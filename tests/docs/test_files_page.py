@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +22,7 @@ from tactomo.scans import Mark
 from tactomo_client.recording_file import CHANNELS, PROFILE
 from tactomo_models import Flag, Press, Reference, SkinSimulator, load_description
 from tactomo_models.batch import reconstruct_file
-from tactomo_models.calibration import load_cell
 from tactomo_models.calibration.calibration_file import PressureCalibration
-from tactomo_models.calibration.load_cell import read_load_cell
 
 PAGE = "docs/files.md"
 
@@ -63,17 +60,6 @@ def test_the_arrays_that_are_written_have_their_rows(batch: Path) -> None:
         assert made[name].dtype == np.dtype(dtype), name
         wanted = [sizes[axis] for axis in shape.strip("(),").replace(",", " ").split()]
         assert list(made[name].shape) == wanted, name
-
-
-def test_every_column_of_a_load_cells_log_has_its_row(tmp_path: Path) -> None:
-    told = table(PAGE, "## A load cell's log").keys()
-    values = {"direction": "up", "pressure_kpa": "100", "magnitude": "0.1"}
-    log = tmp_path / "log.csv"
-    log.write_text(",".join(told) + "\n" + ",".join(values.get(name, "50") for name in told))
-    cell = read_load_cell(log)
-    assert (cell.pressure_kpa[0], cell.magnitude[0], cell.direction(0)) == (100, 0.1, "up")
-    read = inspect.getsource(load_cell)
-    assert [name for name in told if f'"{name}"' not in read] == []
 
 
 def test_every_field_of_a_calibration_has_its_row() -> None:

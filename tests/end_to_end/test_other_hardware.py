@@ -112,10 +112,3 @@ def test_each_protocol_has_an_example_of_a_configuration(name: str) -> None:
     config = load_config(repository() / "deploy" / "examples" / f"{name}.toml")
     assert config.protocol == name
     protocol_named(name, load_description(config.description))
-
-
-def test_every_protocol_is_on_the_page() -> None:
-    for name in available_protocols():
-        assert f"`{name}`" in PAGE.text
-    for description in re.findall(r"`(\w+_(?:disc|square))`", PAGE.text):
-        load_description(description)

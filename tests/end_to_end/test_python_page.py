@@ -40,14 +40,6 @@ def run(code: str, names: dict[str, Any]) -> None:
     exec(compile(code, "docs/python.md", "exec"), names)
 
 
-def test_each_block_is_run_by_a_test() -> None:
-    told = sum(len(PAGE.blocks("python", heading)) for heading in RUN_AT_ONCE)
-    told += (
-        len(FILES) + 1 + len(PAGE.blocks("python", "Read")) + len(PAGE.blocks("python", "Follow"))
-    )
-    assert len(PAGE.blocks("python")) == told
-
-
 def test_the_method_is_the_example() -> None:
     assert PAGE.file("own_method.py") == (repository() / "examples/own_method.py").read_text()
 

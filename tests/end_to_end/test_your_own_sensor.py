@@ -13,14 +13,10 @@ from pathlib import Path
 import pytest
 from newcomer import Newcomer
 from page import Page
-from tactomo.acquisition.port import contradiction
 from tactomo_models import (
-    DescriptionError,
     SensorDescription,
-    load_description,
 )
 from tactomo_models.sensor.outline import Pad
-from tactomo_protocol import Channel, Hello, SampleFormat
 
 PAGE = Page("docs/your_own_sensor.md")
 FILE = "my_sheet.toml"
@@ -144,32 +140,3 @@ def test_an_insole_goes_from_a_drawing_to_contacts_in_ros(newcomer: Newcomer) ->
     place = [float(last[f"position_{axis}_m"]) for axis in "xyz"]
     assert place == pytest.approx((0, 0.098, 0.0135), abs=1.5e-3)  # as the page says
     assert float(last["force_n"]) == pytest.approx(90, rel=0.05)
-
-
-def test_what_is_refused_is_refused_in_the_pages_words(tmp_path: Path) -> None:
-    right = PAGE.file(FILE)
-    for written, wrong in (
-        ("per_side = [5, 3] ", "per_side = 4\npitch_m = 0.03 "),
-        ("length_m = 0.005 ", "length_m = 0.024 "),
-        ("width_m = 0.120", "widht_m = 0.120"),
-        ("schema = 1", '[mount]\nframe = "arm"\n[mount.cylinder]\nradius_m = 0.018'),
-    ):
-        assert written in right
-        text = right.replace(written, wrong, 1)
-        if wrong.startswith("[mount]"):
-            text = f"{right}\n{wrong}"
-        if wrong.startswith("per_side"):
-            text = text.replace("pitch_m = 0.024 ", "")
-        (tmp_path / FILE).write_text(text)
-        with pytest.raises(DescriptionError) as caught:
-            load_description(tmp_path / FILE)
-        said = str(caught.value).removeprefix(f"{tmp_path / FILE}: ")
-        told = [cell for cell in PAGE.text.split("`") if cell and cell in said]
-        assert max(map(len, told)) > 20, said
-
-
-def test_a_device_of_another_pattern_is_refused_in_the_pages_words(tmp_path: Path) -> None:
-    (tmp_path / FILE).write_text(PAGE.file(FILE))
-    both = (Channel.MAGNITUDE, Channel.STRUCTURE)
-    round_ = Hello("twin-skin_round", "1", both, 16, 8, 1, 192, SampleFormat.INT32, 1.0, 20.0)
-    assert contradiction(round_, load_description(tmp_path / FILE)) in PAGE.text

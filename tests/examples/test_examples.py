@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import os
 import re
 import runpy
@@ -45,14 +44,6 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
         return capsys.readouterr().out
 
     return go
-
-
-@pytest.mark.parametrize("program", PROGRAMS, ids=lambda p: p.name)
-def test_a_program_is_short_and_says_how_it_is_run(program: Path) -> None:
-    text = program.read_text("utf-8")
-    assert len(text.splitlines()) <= 40
-    told = ast.get_docstring(ast.parse(text)) or ""
-    assert re.search(rf"^(Run|    tactomo).*{program.stem}", told, re.M)
 
 
 def test_programs_are_listed_where_a_reader_looks() -> None:

@@ -28,21 +28,6 @@ def texts(value: Any) -> Iterator[str]:
         yield value
 
 
-def panels(layout: Any) -> Iterator[str]:
-    if isinstance(layout, str):
-        yield layout
-    else:
-        yield from panels(layout["first"])
-        yield from panels(layout["second"])
-
-
-def test_every_panel_has_a_configuration() -> None:
-    layout = json.loads(shipped_layout())
-    assert sorted(panels(layout["layout"])) == sorted(layout["configById"])
-    kinds = {name.partition("!")[0] for name in layout["configById"]}
-    assert {"3D", "Plot", "RosOut"} <= kinds
-
-
 def test_it_names_no_topic_and_no_field_that_there_is_not() -> None:
     paths = [text for text in texts(json.loads(shipped_layout())) if text.startswith("/skin/")]
     assert {path.split("/")[2].partition(".")[0] for path in paths} == TOPICS
