@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import signal
 import time
 from pathlib import Path
 from typing import Any
@@ -13,12 +11,11 @@ from typing import Any
 import pytest
 from fixture_types import Run
 from page import first_line_of_the_readme
-from processes import children_of, is_running
 from selenium.webdriver import ActionChains, Chrome
 from selenium.webdriver.common.by import By
 from tactomo_client import Frame, request, subscribe
 from waiting import PATIENCE_S, wait_until
-from whole_system import SENSOR, Demo, running_demo
+from whole_system import SENSOR, Demo
 
 
 @pytest.mark.parametrize(
@@ -116,18 +113,3 @@ def test_doctor_finds_a_healthy_skin_and_noise(tactomo: Run, demo: Demo) -> None
     request("noise", demo.twin, PATIENCE_S, noise_v=0.02)  # for good: no test after this one
     request("garbage", demo.twin, PATIENCE_S, count=4000)
     assert {each["level"] for each in snrs(status=1)} <= {"fault", "broken"}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
-def test_a_demo_that_ends_leaves_no_process_behind(
-    number: signal.Signals, small_file: Path
-) -> None:
-    with running_demo("--description", str(small_file)) as demo:
-        children = children_of(demo.process.pid)
-        assert len(children) == 3
-        os.kill(demo.process.pid, number)
-        wait_until(lambda: not any(is_running(pid) for pid in children), "the children to end")
-        wait_until(lambda: demo.process.poll() is not None, "the demo to end")
-    if number != signal.SIGKILL:
-        assert demo.process.returncode in (0, 130)

@@ -37,8 +37,3 @@ def test_a_contact_keeps_its_trace_while_others_come_and_go(tmp_path: Path) -> N
         *({1: 1}, {1: 1, 2: 2}, {1: 1, 2: 2, 3: 3}, {2: 2, 3: 3}, {2: 2, 3: 3, 4: 1}),
         *({3: 3, 4: 1}, {}, {3: 3}, {3: 3, 5: 1}, {9: 1}),
     ]
-
-
-def test_a_restarted_daemon_begins_anew(tmp_path: Path) -> None:
-    frames = [frame(1, [1, 2]), frame(2, [2]), frame(3, [2], session="b")]
-    assert traces(tmp_path / "a.mcap", frames) == [{1: 1, 2: 2}, {2: 2}, {2: 1}]

@@ -84,8 +84,3 @@ def test_a_wrong_scene_is_refused_with_what_is_wrong(tmp_path: Path, text: str, 
         load_scene(path)
     assert says in str(caught.value)
     assert str(path) in str(caught.value)
-
-
-def test_a_missing_scene_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"No such file.* grasp, "):
-        load_scene(tmp_path / "none.toml")

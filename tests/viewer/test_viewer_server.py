@@ -23,7 +23,7 @@ import pytest
 import tactomo_viewer
 from aiohttp.test_utils import TestClient, TestServer
 from fake_control import FakeControl
-from tactomo_client import ClientError, Contact, ControlError
+from tactomo_client import ClientError, Contact
 from tactomo_client.fake import FakeSensor
 from tactomo_viewer import ViewerError
 
@@ -194,17 +194,6 @@ async def test_an_event_is_as_old_as_when_it_came(sensor: FakeSensor) -> None:
 
 
 @on_loop
-async def test_a_page_hears_whether_others_press(sensor: FakeSensor) -> None:
-    with FakeControl({"scene": {"presses": [{"id": "finger"}]}}) as twin:
-        async with viewer_of(sensor, twin=twin.address) as viewer, viewer.page() as page:
-            while not (told := await page.next("twin"))["answers"]:
-                pass
-            assert told["others_press"]
-            twin.answers["scene"] = {"presses": []}
-            assert not (await page.next("twin"))["others_press"]
-
-
-@on_loop
 async def test_a_page_that_is_loaded_again_finds_its_own_press_gone(sensor: FakeSensor) -> None:
     with FakeControl({"scene": {"presses": []}, "press": {}, "release": {}}) as twin:
         async with viewer_of(sensor, twin=twin.address) as viewer:
@@ -249,28 +238,6 @@ async def test_a_slow_page_gets_few_frames_and_none_of_them_old(sensor: FakeSens
 # What the page may do
 
 
-@on_loop
-async def test_commands_reach_the_daemon_and_refusals_the_page(sensor: FakeSensor) -> None:
-    with FakeControl({"tare": {"scans": 20}, "set_tier": {"tier": "quiet"}}) as daemon:
-        async with viewer_of(sensor, daemon.address) as viewer, viewer.page() as page:
-            reply = await page.ask(type="command", command="tare")
-            assert (reply["ok"], reply["result"]) == (True, {"scans": 20})
-            await page.ask(type="command", command="set_tier", arguments={"tier": "quiet"})
-            await page.ask(type="command", command="record_start", arguments={})
-            await page.ask(type="command", command="record_stop")
-            told = {"name": "tare_refused", "cause": "somebody presses", "next_step": "lift it"}
-            daemon.answers["tare"] = ControlError(told["cause"], told["next_step"], told["name"])
-            reply = await page.ask(type="command", command="tare")
-            assert (reply["ok"], reply["error"]) == (False, told)
-    assert daemon.requests == [
-        ("tare", {}),
-        ("set_tier", {"tier": "quiet"}),
-        ("record_start", {}),
-        ("record_stop", {}),
-        ("tare", {}),
-    ]
-
-
 FORBIDDEN: list[tuple[Message, str]] = [
     ({"type": "command", "command": "shutdown"}, "unknown_command"),
     ({"type": "command", "command": ["tare"]}, "unknown_command"),
@@ -303,31 +270,6 @@ async def test_no_question_breaks_the_socket(sensor: FakeSensor) -> None:
 
 
 # Pressing
-
-
-@on_loop
-async def test_presses_reach_the_twin_in_order(sensor: FakeSensor) -> None:
-    with FakeControl() as twin:
-        async with viewer_of(sensor, twin=twin.address) as viewer, viewer.page() as page:
-            while not (await page.next("twin"))["answers"]:
-                pass  # it may be slow to answer the first time
-            finger = {"pressure_kpa": 180, "radius_mm": 15, "shape": "ring"}
-            for x_mm in (1.5, 2.5):
-                await page.socket.send_json(
-                    {"type": "press", "press": "1", "x_mm": x_mm, "y_mm": -3, **finger}
-                )
-            assert (await page.ask(type="release", press="1"))["ok"] is True
-            assert (await page.ask(type="clear"))["ok"] is True
-    asked = [request for request in twin.requests if request[0] != "scene"]
-    assert [command for command, _ in asked] == ["press", "press", "release", "clear"]
-    names = {arguments.pop("id") for command, arguments in asked[:3]}
-    assert len(names) == 1
-    assert [arguments for _, arguments in asked] == [
-        {"x_mm": 1.5, "y_mm": -3, **finger},
-        {"x_mm": 2.5, "y_mm": -3, **finger},
-        {},
-        {},
-    ]
 
 
 @on_loop

@@ -191,15 +191,6 @@ def test_what_a_recording_does_not_tell_is_said_of_a_recording(
     assert step in drift["next_step"]
 
 
-def test_scans_without_times_say_nothing_of_drift(tactomo: Run, rest: FloatArray) -> None:
-    np.savez("in.npz", rest=noisy(rest))
-    drift = about(
-        report(tactomo("doctor", "in.npz", "--json"))["channels"]["rest"]["findings"], "drift"
-    )
-    assert drift["detail"] == "not known: nobody says when scans were taken"
-    assert "with their times" in drift["next_step"]
-
-
 def record_board(paper: SensorDescription, volts: FloatArray, numbers: Sequence[int]) -> None:
     """Record a board that prints: when its scans came is all that is known of time."""
     both = (Channel.MAGNITUDE, Channel.STRUCTURE)

@@ -18,7 +18,6 @@ from tactomo.acquisition.adapters import (
     lasting_name,
     latency_timer_ms,
     list_adapters,
-    look_alikes,
     modem_manager_runs,
 )
 from tactomo.acquisition.connection import Connection
@@ -55,22 +54,6 @@ def test_an_ftdi_adapter_is_described_in_full(machine: FakeMachine) -> None:
     ]
 
 
-def test_a_name_that_goes_while_it_is_read_is_absent(
-    machine: FakeMachine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    machine.plug_ftdi("ttyUSB0", "1-3", "A50285BI")
-    readlink = os.readlink
-
-    def unplugged(path: Any) -> str:
-        if "by-id" in str(path):
-            raise FileNotFoundError(path)
-        return str(readlink(path))
-
-    monkeypatch.setattr(os, "readlink", unplugged)
-    (adapter,) = list_adapters(machine.root)
-    assert [Path(name).parent.name for name in adapter.names] == ["by-path"]
-
-
 def test_usb_comes_first_by_number_and_what_is_not_there_not_at_all(machine: FakeMachine) -> None:
     machine.build_in("ttyS0", 4)
     machine.build_in("ttyS1", 0)
@@ -79,22 +62,6 @@ def test_usb_comes_first_by_number_and_what_is_not_there_not_at_all(machine: Fak
         machine.plug_acm(f"ttyACM{number}", f"1-{number}", str(number))
     paths = [adapter.path for adapter in list_adapters(machine.root)]
     assert paths == ["/dev/ttyACM2", "/dev/ttyACM10", "/dev/ttyS0"]
-
-
-def test_adapters_without_a_number_are_told_apart_by_their_socket(machine: FakeMachine) -> None:
-    machine.plug_ch340("ttyUSB0", "1-1")
-    machine.plug_ch340("ttyUSB1", "1-2")
-    machine.plug_ftdi("ttyUSB2", "1-3", "A5")
-    machine.plug_ftdi("ttyUSB3", "1-4", "B6")
-    adapters = list_adapters(machine.root)
-    assert [lasting_name(adapter, adapters).split("usb-", 1)[1] for adapter in adapters] == [
-        "0:1:1.0",
-        "0:2:1.0",
-        "FTDI_FT232R_USB_UART_A5-if00-port0",
-        "FTDI_FT232R_USB_UART_B6-if00-port0",
-    ]
-    alike = [[other.path for other in look_alikes(one, adapters)] for one in adapters]
-    assert alike == [["/dev/ttyUSB1"], ["/dev/ttyUSB0"], [], []]
 
 
 def test_a_microcontroller_has_no_latency_timer_and_our_own_rules_name_goes_first(

@@ -33,14 +33,6 @@ def test_what_comes_says_how_it_does(
     assert device.judge(110.0) is DeviceState.SILENT
 
 
-def test_a_trouble_lasts_until_scans_come(device: Liveness) -> None:
-    device.judge(103.0)
-    device.reopened(106.0)
-    assert device.judge(106.1) is DeviceState.SILENT
-    device.heard(106.2, 1, 1)
-    assert device.judge(106.3) is DeviceState.RUNNING
-
-
 def reopenings(device: Liveness, until_s: int) -> list[int]:
     """Return when the port is opened anew, in whole seconds from 100 s on."""
     times = []
@@ -68,14 +60,6 @@ def test_a_device_that_speaks_is_left_alone_and_soon_looked_after_again(device: 
         assert not device.is_reopening_due(now_s)
     device.judge(339 + REOPEN_S)
     assert device.is_reopening_due(339 + REOPEN_S)
-
-
-def test_a_device_that_is_plugged_in_again_begins_anew(device: Liveness) -> None:
-    reopenings(device, 200)
-    device.opened(300.0)
-    assert device.judge(300.1) is DeviceState.STARTING
-    device.judge(300 + REOPEN_S)
-    assert device.is_reopening_due(300 + REOPEN_S)
 
 
 # Slow by nature

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from tactomo.acquisition.skew import Skew
@@ -60,21 +58,6 @@ def test_the_skew_is_the_difference_of_the_dates_with_its_sign() -> None:
     assert percentiles["p50"] == pytest.approx(3.0)
 
 
-def test_one_device_needs_no_fit_to_be_exact() -> None:
-    skew = Skew()
-    timing = skew.timing(pairs(skew, 3, late_ns=20_000_000, port=0, delay_ns=None))
-    assert timing.skew_ns == -20_000_000
-    assert not timing.is_dated
-    assert not timing.is_skewed  # a device may scan its channels one after the other
-
-
-def test_two_clocks_that_are_not_known_yet_have_no_skew() -> None:
-    skew = Skew()
-    timing = skew.timing(pairs(skew, 20, delay_ns=None))
-    assert timing.skew_ns is None
-    assert not timing.is_dated
-
-
 @pytest.mark.parametrize("behind", [-40, -1, 1, 3, 1_000_000])
 @pytest.mark.parametrize("start", [0, 2**32 - 12])
 def test_a_board_that_missed_pulses_is_noticed_and_forgiven_once_cured(
@@ -100,16 +83,6 @@ def test_a_pair_too_far_apart_is_flagged_at_once() -> None:
     assert not skew.is_skewed
 
 
-def test_a_board_that_was_reset_is_noticed_before_its_clock_is_known() -> None:
-    skew = Skew()
-    pairs(skew, 20, start=1000)
-    for number in range(20):
-        at_ns = 10**12 + (1020 + number) * PERIOD_NS
-        skew.take(scan(MAGNITUDE, 1020 + number, at_ns))
-        skew.take(scan(STRUCTURE, number, at_ns, 1, None, device_us=number * 50_000))
-    assert skew.is_skewed
-
-
 def test_lags_bursts_and_a_silent_channel_are_no_skew() -> None:
     """Structure scans come five at once, then not at all for a minute, then again."""
     skew = Skew()
@@ -124,15 +97,6 @@ def test_lags_bursts_and_a_silent_channel_are_no_skew() -> None:
                 skew.take(structure)
             structures.clear()
         assert not skew.is_skewed
-
-
-def test_clocks_that_stand_still_tell_nothing() -> None:
-    skew = Skew()
-    for number in range(50):
-        for port, channel in enumerate((MAGNITUDE, STRUCTURE)):
-            skew.take(scan(channel, number + 7 * port, number * PERIOD_NS, port, None, 0))
-    assert not skew.is_skewed
-    assert math.isfinite(skew.out_of_step_ns)
 
 
 def test_an_overload_that_holds_boards_up_by_more_or_less_is_no_missed_pulse() -> None:

@@ -254,20 +254,6 @@ def test_the_frame_cannot_be_pressed(paper: SensorDescription, artifact: Artifac
     assert max(x.max(), y.max()) <= edge + 1e-9
 
 
-def test_a_thicker_sheet_gives_smaller_voltages(small: SensorDescription) -> None:
-    """Twice as thick with contacts twice as good: half the volts, in the same proportions."""
-    thick = variant(
-        small,
-        sheet={"thickness_m": 2e-4},
-        electrodes={"contact_impedance_ohm_m": 5.0},
-    )
-    volts = []
-    for sensor in (small, thick):
-        model = ForwardModel(sensor, solve_bare_sheet(sensor, mesh_sheet(sensor, refinements=1)))
-        volts.append(model.bare_voltages * model.volts_per_unit)
-    np.testing.assert_allclose(volts[0], 2 * volts[1], rtol=1e-9)
-
-
 def test_small_electrodes_agree_with_pyeits_point_electrodes(small: SensorDescription) -> None:
     """The same triangles, the same unit current: what is left is how large the electrodes are.
 

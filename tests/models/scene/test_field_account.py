@@ -117,27 +117,6 @@ def test_images_show_what_presses(sensor: Sensor, kind: str) -> None:
     assert force == pytest.approx(account.contacts.force_n[0], rel=0.05)
 
 
-def test_each_contact_has_its_own_numbers(sensor: Sensor) -> None:
-    each = (
-        contact(-0.014, -0.004, 0.007, peak=0.9),
-        contact(0.013, 0.008, 0.006, peak=0.6, edge=0.5),
-    )
-    account = account_of(sensor, *each)
-    assert account.contacts is not None
-    order = account.areas.centres_m[:, 0].argsort()
-    assert account.contacts.peak_kpa[order] == pytest.approx([180, 120])
-    assert account.contacts.edge[order] == pytest.approx([0, 0.5])
-    areas = np.pi * np.array([0.007, 0.006]) ** 2
-    assert account.areas.areas_m2[order] == pytest.approx(areas, rel=0.05)
-
-
-def test_nothing_pressed_is_no_area(sensor: Sensor) -> None:
-    account = account_of(sensor)
-    assert len(account.areas) == len(account.magnitudes) == 0
-    assert not account.map.any()
-    assert not account.pressure_kpa.any()
-
-
 def test_without_a_magnitude_scan_areas_have_no_magnitude(
     forward: ForwardModel, small: SensorDescription
 ) -> None:

@@ -76,16 +76,6 @@ def sees(tracker: ContactTracker, *x_mm: float, area_mm2: float = 200.0) -> list
 places = st.lists(st.tuples(st.floats(-0.07, 0.07), st.floats(-0.07, 0.07)), max_size=6)
 
 
-@given(places)
-def test_contacts_that_stand_still_keep_their_identity(centres: list[tuple[float, float]]) -> None:
-    tracker = ContactTracker()
-    at = np.array(centres).reshape(-1, 2)
-    first = update(tracker, at)
-    assert len(set(first)) == len(first)
-    again = update(tracker, at)
-    assert sorted(again) == sorted(first)
-
-
 @given(places, places)
 def test_no_identity_is_given_twice(
     before: list[tuple[float, float]], after: list[tuple[float, float]]

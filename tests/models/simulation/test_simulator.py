@@ -85,21 +85,6 @@ def test_a_press_off_the_sheet_or_of_no_pressure_is_none(bench: SkinSimulator) -
         assert change(bench, nothing) == {"magnitude": 0, "structure": 0}
 
 
-def test_the_stronger_of_two_indenters_on_one_place_counts(bench: SkinSimulator) -> None:
-    strong = bench.voltages([press(190)])
-    for both in ([press(120), press(190)], [press(190), press(120)]):
-        for name, volts in bench.voltages(both).items():
-            np.testing.assert_allclose(volts, strong[name], rtol=1e-12)
-
-
-def test_scenes_do_not_remember_each_other(bench: SkinSimulator) -> None:
-    before = {name: volts.copy() for name, volts in bench.voltages([press(150)]).items()}
-    bench.voltages([press(190), Press(-0.01, 0.01, 150.0, 0.005)])
-    bench.voltages([])
-    for name, volts in bench.voltages([press(150)]).items():
-        np.testing.assert_array_equal(volts, before[name])
-
-
 def test_an_uneven_sheet_is_as_uneven_as_asked_and_the_same_for_a_seed(
     small: SensorDescription, bench: SkinSimulator
 ) -> None:
