@@ -30,7 +30,14 @@ STATUS = {
     "state": "running",
     "version": "0.1.0",
     "uptime_s": 12.0,
-    "description": {"model": "paper_square", "modalities": ["magnitude", "structure"]},
+    "description": {
+        **{"model": "paper_square", "modalities": ["magnitude", "structure"]},
+        "pressure_max_kpa": 250.0,
+        "calibration": {
+            **{"taken": "2026-01-31T12:00:00+00:00", "readings": 14},
+            **{"range_kpa": [131.2, 250.0], "sigma_kpa": 2.34},
+        },
+    },
     "source": {"kind": "twin"},
     "ports": [
         {
@@ -98,6 +105,7 @@ def test_status_shows_what_matters(tactomo: Run, control: Any) -> None:
         *("refused: [neither] contact nor drift", "magnitude drifted by -1.23%, unevenly by 0.09%"),
         "cell reads 255.5: 127.0 ± 2.5 N, not used: it contradicts the sheets",
         "pad no reading within its limits",
+        "calibrated 2026-01-31 by 14 readings: 131 to 250 kPa ± 2.3",
         "12 ms of work, 50% of it while other programs use the processor",
     ):
         assert words in result.stdout

@@ -64,16 +64,6 @@ def frames(
     ]
 
 
-def test_a_map_suffices(small: SensorDescription, volts: tuple[Any, Any]) -> None:
-    own = Own(lambda image: Estimate(map=image))
-    first, second = frames(small, volts, own, 2)
-    assert (first.tier, first.failure) == ("Own", "")
-    assert [contact.magnitude for contact in first.contacts] == pytest.approx([0.2])
-    assert first.contacts[0].id == second.contacts[0].id
-    assert own.previous[0] is None
-    assert own.previous[1] is not None
-
-
 def refuse(image: FloatArray) -> Estimate:
     raise UnsolvableError("no voltage is large enough")
 

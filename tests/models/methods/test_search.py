@@ -119,10 +119,6 @@ def test_an_outline_that_the_mesh_has_bent_is_seldom_surely_another(
     assert np.count_nonzero(are_bent) <= 1
 
 
-def test_contacts_are_found_from_nothing(skin: Skin) -> None:
-    assert_at(Search(skin.sensor.fit).advance(None, skin.frame(LEFT, RIGHT)), LEFT, RIGHT)
-
-
 @pytest.mark.parametrize("above", [1.1, 1.3])
 def test_a_faint_press_is_told_that_a_noise_test_overlooks(stacked: Skin, above: float) -> None:
     """Begun below the onset, where a peak has no slope, as where the graded sheet is quiet."""
