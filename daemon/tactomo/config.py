@@ -141,21 +141,13 @@ class DaemonConfig(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     log_format: LogFormat = "auto"
 
     @model_validator(mode="after")
-    def _ports_differ(self) -> Self:
+    def _fits_together(self) -> Self:
         if len(set(self.ports)) != len(self.ports):
             raise ValueError("ports: the two ports are the same one")
         if self.protocol != NATIVE and len(self.ports) > 1:
             raise ValueError(f"ports: a device of protocol {self.protocol} has one port; give one")
-        return self
-
-    @model_validator(mode="after")
-    def _addresses_differ(self) -> Self:
         if self.stream == self.control and not self.stream.endswith(":0"):
             raise ValueError("stream and control have the same address")
-        return self
-
-    @model_validator(mode="after")
-    def _addresses_are_guarded(self) -> Self:
         for key in ("stream", "control"):
             if self.curve is None and not is_local(getattr(self, key)):
                 error = needs_keys(getattr(self, key))

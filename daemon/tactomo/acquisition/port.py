@@ -34,7 +34,6 @@ from tactomo.acquisition.companion_log import CompanionLog
 from tactomo.acquisition.connection import Connection, ReplaySource
 from tactomo.acquisition.device_clock import MAX_RATE, ClockState, DeviceClock
 from tactomo.acquisition.liveness import DeviceState, Liveness
-from tactomo.acquisition.open_serial import other_holders
 from tactomo.events import OnEvent, Rises, times
 from tactomo.protocols import PortProtocol, Trouble
 from tactomo.recordings.recorder import Recorder
@@ -111,8 +110,6 @@ class PortReader(Worker):
         self._asked_s = 0.0  # when the device was last asked, or last sent a scan
         self._trouble_of_protocol: Trouble | None = None
         self._has_risen = Rises()
-        self._judged: DeviceState | None = None  # when sharers were last looked for
-        self._sharers = ""
         self._is_zeroing = threading.Event()
         self._fault, self._fault_s = "", 0.0  # what was last against the protocol, and when
         self._unanswered_s: float | None = None  # since when no command has been acknowledged
@@ -445,16 +442,9 @@ class PortReader(Worker):
 
     def _tell_trouble(self, state: DeviceState) -> None:
         trouble = self._trouble(state)
-        if state is not self._judged:  # looked for now and then: through all processes
-            sharers = "; ".join(map(str, other_holders(self.url))) if trouble else ""
-            # Which only root can see.
-            self._sharers = (
-                f"; another process has the port open, too ({sharers})" if sharers else ""
-            )
-        self._judged = state
         if trouble and not (state is DeviceState.IDLE and self._has_fault):
             name, next_step = TROUBLES[state]
-            self._tell(name, trouble + self._sharers, next_step)
+            self._tell(name, trouble, next_step)
         elif not trouble and not self.refusal and state is not DeviceState.STARTING:
             self._tell("device_speaks")
 

@@ -54,7 +54,7 @@ COMMANDS = {
         (RUN, "twin", "Simulate a skin behind simulated firmware.", "run.demo"),
         (RUN, "viewer", "Serve a web page with a daemon's maps and contacts.", "run.serve"),
         (RUN, "foxglove", "Serve maps, contacts and events to Foxglove.", "run.serve"),
-        (STEER, "status", "Show the daemon's state, problems first.", "steer.status"),
+        (STEER, "status", "Show the daemon's state, problems first.", "steer.steer"),
         (STEER, "doctor", "Examine a skin at rest, with next steps.", "doctor.doctor"),
         (STEER, "watch", "Show map, contacts and health in the terminal.", "steer.watch"),
         (STEER, "tare", "Take a new reference of the unloaded skin.", "steer.steer"),

@@ -13,8 +13,6 @@ from tactomo.cli.output import print_json, say
 from tactomo.errors import needs
 
 if TYPE_CHECKING:
-    from tactomo_models import SensorDescription
-
     from tactomo_lab.training.configurations import Prepared
     from tactomo_lab.training.train import Epoch, Settings, Training
 
@@ -124,11 +122,20 @@ def train(
     tactomo then uses the network in the cache for this sensor, instead of the shipped network;
     delete the file to return to the shipped one. Needs `pip install 'tactomo-lab[train]'`.
     """
+    from rich.text import Text
+    from tactomo.cli.console import Console
+
     with needs("training", EXTRA):
         from tactomo_models import load_description
         from tactomo_models.methods.trained_networks import own_path
 
-        from tactomo_lab.training.configurations import KIND, SETTINGS, export_trained
+        from tactomo_lab.training.configurations import (
+            KIND,
+            SETTINGS,
+            WIDTHS,
+            export_trained,
+            prepare,
+        )
         from tactomo_lab.training.train import use
 
         use(device, jobs)
@@ -141,7 +148,8 @@ def train(
             seed=seed,
             device=device,
         )
-        prepared = _prepare(configuration, folder, description, seed)
+        with Console(stderr=True).status(Text(f"reading {folder}")):
+            prepared = prepare(WIDTHS[configuration], folder, description, seed)
         kept = checkpoint or folder / f"{configuration}.pt"
         training = _train(prepared, settings, kept, configuration)
         written = output or own_path(description, KIND)
@@ -157,19 +165,6 @@ def train(
         print_json({**told, **asdict(settings), "history": history})
     else:
         say(f"wrote {written}: {written.stat().st_size / 1e6:.1f} MB")
-
-
-def _prepare(
-    configuration: str, folder: Path, description: SensorDescription, seed: int
-) -> Prepared:
-    """Read the scenes."""
-    from rich.text import Text
-    from tactomo.cli.console import Console
-
-    from tactomo_lab.training.configurations import WIDTHS, prepare
-
-    with Console(stderr=True).status(Text(f"reading {folder}")):
-        return prepare(WIDTHS[configuration], folder, description, seed)
 
 
 def _train(

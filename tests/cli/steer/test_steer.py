@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from fake_control import FakeControl
 from fixture_types import Run
-from tactomo.cli.steer.status import lines_of
+from tactomo.cli.steer.steer import lines_of
 from tactomo.errors import TactomoError
 from tactomo.running import Running, announced
 from tactomo.service.health_issues import FLAG_ADVICE, health_issues
