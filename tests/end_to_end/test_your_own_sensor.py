@@ -18,6 +18,8 @@ from tactomo_models import (
 )
 from tactomo_models.sensor.outline import Pad
 
+pytestmark = pytest.mark.slow
+
 PAGE = Page("docs/your_own_sensor.md")
 FILE = "my_sheet.toml"
 SMALLER = {"--count 20": "--count 1", "--seconds 3": "--seconds 1"}
@@ -31,7 +33,6 @@ def newcomer(tmp_path: Path) -> Newcomer:
     return Newcomer(tmp_path, SMALLER | SHORTER)
 
 
-@pytest.mark.slow
 def test_a_description_is_drawn_built_pressed_and_judged(newcomer: Newcomer) -> None:
     with newcomer:
         drawn, built, info = newcomer.follow(PAGE.commands("2") + PAGE.commands("3"))
@@ -53,7 +54,6 @@ def test_a_description_is_drawn_built_pressed_and_judged(newcomer: Newcomer) -> 
         assert (newcomer.folder / "fit.png").exists()
 
 
-@pytest.mark.slow
 def test_a_device_is_found_examined_tared_and_recorded(newcomer: Newcomer) -> None:
     with newcomer:
         newcomer.follow(PAGE.commands("7"))
@@ -64,7 +64,6 @@ def test_a_device_is_found_examined_tared_and_recorded(newcomer: Newcomer) -> No
     assert "/etc/tactomo/palm.toml" in newcomer.run(install)
 
 
-@pytest.mark.slow
 def test_a_bent_sheet_says_where_on_the_link_it_is_pressed(newcomer: Newcomer) -> None:
     sheet = newcomer.folder / FILE
     sheet.write_text(sheet.read_text() + "".join(PAGE.blocks("toml", "10")))
@@ -85,7 +84,6 @@ def test_a_bent_sheet_says_where_on_the_link_it_is_pressed(newcomer: Newcomer) -
     assert (newcomer.folder / "bent_bag" / "metadata.yaml").exists()
 
 
-@pytest.mark.slow
 def test_a_load_cell_is_described_and_moved_by_a_press(newcomer: Newcomer) -> None:
     section = "A load cell beneath the sheet"
     copy, demo, press, watch = PAGE.commands(section)
@@ -98,7 +96,6 @@ def test_a_load_cell_is_described_and_moved_by_a_press(newcomer: Newcomer) -> No
         newcomer.wait_for(watch, " mm ")
 
 
-@pytest.mark.slow
 def test_a_sheet_of_another_outline_is_described_and_drawn(newcomer: Newcomer) -> None:
     section = "A sheet of another outline"
     with newcomer:
@@ -114,7 +111,6 @@ def test_a_sheet_of_another_outline_is_described_and_drawn(newcomer: Newcomer) -
         assert sum(isinstance(each, Pad) for each in pads) == 1
 
 
-@pytest.mark.slow
 def test_an_insole_goes_from_a_drawing_to_contacts_in_ros(newcomer: Newcomer) -> None:
     section = "An insole on a curved sole"
     drawing, surface, reader = PAGE.blocks("python", section)

@@ -176,6 +176,7 @@ def test_a_lost_structure_scan_is_bridged_by_the_last_shape(
     assert reconstructor.reconstruct(elsewhere, None).tier == "network"
 
 
+@pytest.mark.slow
 def test_a_last_shape_without_contacts_stands_in_for_nothing(
     reconstructor: Reconstructor, simulator: SkinSimulator
 ) -> None:

@@ -72,7 +72,8 @@ def test_scans_that_repeat_earlier_ones_are_left_out_and_told(tactomo: Run, tmp_
         )
 
 
-@pytest.mark.parametrize("layout", ["named", pytest.param("plain", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("layout", ["named", "plain"])
 def test_companions_of_a_file_are_judged_in_every_layout(
     tactomo: Run, tmp_path: Path, layout: str
 ) -> None:

@@ -18,6 +18,8 @@ from tactomo_models import Press, SkinSimulator, load_description
 from tactomo_models.arrays import FloatArray
 from tactomo_protocol import Channel
 
+pytestmark = pytest.mark.slow
+
 Volts = Mapping[Channel, FloatArray]
 HELD = [Press(x, y, 180.0) for x in (-0.03, 0.03) for y in (-0.03, 0.03)]
 
@@ -69,7 +71,6 @@ def is_known(frame: Mapping[str, Any]) -> bool:
     return TOUCHES_SEEN.issuperset(frame["flags"])
 
 
-@pytest.mark.slow
 def test_contacts_held_down_through_a_restart_are_still_there(begin: Any) -> None:
     once(begin)
     b = begin(volts(True))
@@ -83,7 +84,6 @@ def test_contacts_held_down_through_a_restart_are_still_there(begin: Any) -> Non
     assert (released["contacts"], released["flags"]) == ([], [])
 
 
-@pytest.mark.slow
 def test_a_status_between_the_first_reference_and_its_first_frame_is_of_a_tared_skin(
     begin: Any,
 ) -> None:
@@ -102,7 +102,6 @@ def test_a_status_between_the_first_reference_and_its_first_frame_is_of_a_tared_
     assert "no_reference" not in told(b)
 
 
-@pytest.mark.slow
 def test_tares_under_a_press_are_disputed_until_somebody_touches_beside_it_and_tares(
     begin: Any,
 ) -> None:
@@ -127,7 +126,6 @@ def test_tares_under_a_press_are_disputed_until_somebody_touches_beside_it_and_t
     again.listener.event("tared")
 
 
-@pytest.mark.slow
 def test_a_skin_that_has_warmed_since_is_tared_anew(begin: Any) -> None:
     once(begin)
     with np.load(reference_path("left")) as kept:
@@ -138,7 +136,6 @@ def test_a_skin_that_has_warmed_since_is_tared_anew(begin: Any) -> None:
     assert b.step(volts={n: 0.96 * each for n, each in volts(False).items()})["tier"] == "quiet"
 
 
-@pytest.mark.slow
 def test_another_skin_is_not_taken_for_a_load(begin: Any) -> None:
     once(begin)
     description = load_description("paper_square")
@@ -150,10 +147,7 @@ def test_another_skin_is_not_taken_for_a_load(begin: Any) -> None:
     assert (frame["contacts"], frame["flags"]) == ([], [])
 
 
-@pytest.mark.parametrize(
-    "exchanged",
-    [("own-0", "other-1"), pytest.param(("other-0", "other-1"), marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize("exchanged", [("own-0", "other-1"), ("other-0", "other-1")])
 def test_boards_of_another_skin_are_named_at_the_start(
     bench: Start, exchanged: tuple[str, str]
 ) -> None:
@@ -173,7 +167,6 @@ def test_boards_of_another_skin_are_named_at_the_start(
     assert "exchange" in told["next_step"]
 
 
-@pytest.mark.slow
 def test_a_twin_by_another_description_of_the_same_sheet_is_no_exchanged_cable(
     bench: Start,
 ) -> None:
@@ -185,7 +178,6 @@ def test_a_twin_by_another_description_of_the_same_sheet_is_no_exchanged_cable(
     assert "device_changed" not in [told["name"] for told in b.listener.of("event")]
 
 
-@pytest.mark.slow
 def test_where_somebody_moves_at_the_start_the_reference_that_was_kept_is_used(begin: Any) -> None:
     once(begin)
     b = begin(*[volts(False)] * 10, *[volts(True)] * 10)
@@ -193,7 +185,6 @@ def test_where_somebody_moves_at_the_start_the_reference_that_was_kept_is_used(b
     assert len(b.step(volts=volts(True))["contacts"]) == 4
 
 
-@pytest.mark.slow
 def test_a_damaged_file_is_told_and_does_no_harm(begin: Any) -> None:
     once(begin)
     reference_path("left").write_bytes(b"no archive")
@@ -202,7 +193,6 @@ def test_a_damaged_file_is_told_and_does_no_harm(begin: Any) -> None:
     b.listener.event("tared")
 
 
-@pytest.mark.slow
 def test_where_nobody_can_tell_what_lay_on_the_skin_every_frame_says_so_until_a_tare(
     begin: Any,
 ) -> None:
@@ -221,7 +211,6 @@ def test_where_nobody_can_tell_what_lay_on_the_skin_every_frame_says_so_until_a_
     assert b.step(volts=volts(False))["flags"] == []
 
 
-@pytest.mark.slow
 def test_a_pipe_in_the_references_place_is_told_and_not_waited_for(begin: Any) -> None:
     path = reference_path("left")
     path.parent.mkdir(parents=True)
@@ -235,7 +224,6 @@ def test_a_pipe_in_the_references_place_is_told_and_not_waited_for(begin: Any) -
     b.daemon.stop()
 
 
-@pytest.mark.slow
 def test_a_folder_that_cannot_be_written_is_told(begin: Any) -> None:
     reference_path("left").parent.parent.mkdir(parents=True, exist_ok=True)
     reference_path("left").parent.write_text("a file where the folder should be")
@@ -243,7 +231,6 @@ def test_a_folder_that_cannot_be_written_is_told(begin: Any) -> None:
     b.listener.event("reference_not_kept")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("value", [0.0, 2000.0])
 def test_where_nothing_can_be_measured_no_contacts_is_not_known(begin: Any, value: float) -> None:
     b = begin(volts(False))

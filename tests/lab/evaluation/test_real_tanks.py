@@ -16,6 +16,8 @@ from tactomo_lab.evaluation.tanks import (
 )
 from tactomo_models import load_description
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def tanks() -> Tanks:
@@ -23,7 +25,6 @@ def tanks() -> Tanks:
     return read_tanks(path, load_description("tank_uef2017"))
 
 
-@pytest.mark.slow
 def test_measured_tanks(tanks: Tanks) -> None:
     imager = TankImager(load_description("tank_uef2017"))
     methods = ("tikhonov", "noser", "network")
@@ -41,7 +42,6 @@ def test_measured_tanks(tanks: Tanks) -> None:
                 assert sign * np.nanmean(outcome.image[truth == sign]) > 0.3, outcome.name
 
 
-@pytest.mark.slow
 def test_objects_stand_at_the_electrodes_that_their_names_tell() -> None:
     """Another tank, of unknown size: metal and plastic beside electrodes 1, 5, 9, 13."""
     tank = load_description("tank_uef2017")
@@ -63,7 +63,6 @@ def test_objects_stand_at_the_electrodes_that_their_names_tell() -> None:
     assert seen >= 16
 
 
-@pytest.mark.slow
 def test_measured_presses() -> None:
     path = measured("skin_round_presses.npz")
     skin = load_description("skin_round")

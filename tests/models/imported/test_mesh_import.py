@@ -37,7 +37,8 @@ def described(path: Path, electrode_mm: float | None = None) -> SensorDescriptio
     return describe(read_model(path, RADIUS_MM), path, "tank", electrode_mm)[1]
 
 
-@pytest.mark.parametrize("apart", [1, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("apart", [1, 8])
 def test_a_pyeit_model_gives_pyeits_voltages_and_is_not_mirrored(
     tmp_path: Path, disc: Any, apart: int
 ) -> None:

@@ -94,6 +94,7 @@ def test_a_rings_pressure_lies_within_what_is_told(
     assert contact.pressure_sigma_kpa < 0.1 * RING.pressure_kpa
 
 
+@pytest.mark.slow
 def test_a_soft_rim_is_the_fields(
     paper: SensorDescription, methods: dict[str, Reconstructor], simulator: SkinSimulator
 ) -> None:

@@ -55,9 +55,8 @@ def mirrored(volts: FloatArray, around: FloatArray | None) -> FloatArray:
     return 2 * around - volts
 
 
-@pytest.mark.parametrize(
-    "channel", [Channel.MAGNITUDE, pytest.param(Channel.STRUCTURE, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("channel", Channel)
 def test_a_sheet_against_the_sensors_sign_is_flagged(
     reconstructor: Reconstructor, skin: Skin, rest: Reference, channel: Channel
 ) -> None:

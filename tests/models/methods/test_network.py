@@ -185,6 +185,7 @@ def test_a_users_own_network_goes_before_the_shipped_one(
     assert find_network(paper, "network") == own_path(paper, "network")
 
 
+@pytest.mark.slow
 def test_auto_does_without_a_network_that_is_damaged(
     paper: SensorDescription,
     tared: Tared,

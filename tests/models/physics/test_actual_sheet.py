@@ -94,6 +94,7 @@ def test_the_scale_of_the_voltages_is_of_no_matter(
     assert two.bare_voltages == pytest.approx(one.bare_voltages, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_press_changes_the_voltages_as_the_found_sheet_foretells(
     paper: SensorDescription, artifact: Artifact, estimator: SheetEstimator
 ) -> None:

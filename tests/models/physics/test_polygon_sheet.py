@@ -245,6 +245,7 @@ def test_a_pad_in_the_middle_of_a_disc_is_as_bessel_functions_say() -> None:
     assert found == pytest.approx(wanted, rel=2e-3)
 
 
+@pytest.mark.slow
 def test_a_frame_is_nan_off_the_sheet() -> None:
     palm = load_description("palm_l")
     skin, rng = SkinSimulator(palm), np.random.default_rng(0)

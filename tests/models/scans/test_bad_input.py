@@ -270,13 +270,14 @@ def test_swapped_channels_are_told(show: Show) -> None:
     assert Flag.CHANNELS_SWAPPED not in show(PRESS, frames=1).flags
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("channel", "gain"),
     [
         ("magnitude", 0.5),
-        pytest.param("magnitude", 1.3, marks=pytest.mark.slow),
-        pytest.param("structure", 0.7, marks=pytest.mark.slow),
-        pytest.param("structure", 2.0, marks=pytest.mark.slow),
+        ("magnitude", 1.3),
+        ("structure", 0.7),
+        ("structure", 2.0),
     ],
 )
 def test_a_gain_that_changes_is_told_as_one_and_not_as_a_swap(
@@ -291,7 +292,8 @@ def test_a_gain_that_changes_is_told_as_one_and_not_as_a_swap(
         assert bool(is_told) == (scan is rest)
 
 
-@pytest.mark.parametrize("gain", [pytest.param(0.2, marks=pytest.mark.slow), 0.5])
+@pytest.mark.slow
+@pytest.mark.parametrize("gain", [0.2, 0.5])
 def test_a_gain_that_a_press_of_the_whole_sheet_would_explain_is_told(
     reconstructor: Reconstructor, skin: Skin, gain: float
 ) -> None:
