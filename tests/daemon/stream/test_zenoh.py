@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import groupby
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgpack  # type: ignore[import-untyped]
@@ -26,10 +27,11 @@ from needs import need
 from page import Page
 from tactomo.stream import zenoh_bridge
 from tactomo.stream.zenoh_bridge import ENCODING, HEARTBEAT_S, STATUS_HEARTBEAT_S
-from tactomo_client import Contact, subscribe
+from tactomo_client import Contact, request, subscribe
 from tactomo_client.fake import FakeSensor
 from tactomo_client.messages import decode_message, topic
 from waiting import PATIENCE_S, repeated, wait_until
+from whole_system import SENSOR, running_demo
 
 ZENOH = ("-m", "tactomo.cli", "zenoh", "--log-format", "json")
 EXAMPLES = Path(__file__).parents[3] / "deploy/examples"
@@ -189,6 +191,22 @@ def test_a_status_is_sent_when_it_says_something_else_and_its_numbers_are_asked_
     samples.until(lambda: samples.all[-1][1]["state"] == "stale", send)
     came, took_s = len(samples.all), time.monotonic() - began_s
     assert came <= took_s / STATUS_HEARTBEAT_S + 4
+
+
+@pytest.mark.slow
+def test_contacts_of_a_simulated_skin_at_rest_are_sent_by_a_heartbeat(
+    start: Start, desk: zenoh.Session
+) -> None:
+    """Behind a real daemon, whose frames differ in all numbers that say nothing new."""
+    samples = Samples(desk, f"tactomo/arm/{SENSOR}/contacts")
+    with running_demo() as demo:
+        request("tare", demo.control, PATIENCE_S)
+        start(SimpleNamespace(address=demo.stream), robot="arm")
+        wait_until(lambda: samples.all)
+        seen, began_s = len(samples.all), time.monotonic()
+        wait_until(lambda: len(samples.all) >= seen + 10)
+        came, took_s = len(samples.all) - seen, time.monotonic() - began_s
+    assert came <= took_s / HEARTBEAT_S + 2
 
 
 def test_a_query_gets_the_newest_contacts_and_status(
