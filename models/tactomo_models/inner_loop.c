@@ -271,15 +271,22 @@ static double green_at(const Sheet *s, int64_t row, int64_t column) {
   return s->green_single ? s->green_single[place] : s->green_double[place];
 }
 
-/* A block (rows, count) of a symmetric matrix whose lower triangle is given in either precision;
- * row by row, so that every part of it is read once. */
+/* A block (rows, count) of a symmetric matrix whose lower triangle is given in either precision:
+ * what lies below the diagonal by its rows, then the rest by its columns, which are rows there. */
 void block_of(const float *singles, const double *doubles, int64_t rows, const int64_t *row,
               int64_t count, const int64_t *column, double *found) {
   for (int64_t i = 0; i < rows; i++)
-    for (int64_t k = 0; k < count; k++) {
-      int64_t place = in_triangle(row[i], column[k]);
-      found[i * count + k] = singles ? singles[place] : doubles[place];
-    }
+    for (int64_t k = 0; k < count; k++)
+      if (column[k] <= row[i]) {
+        int64_t place = in_triangle(row[i], column[k]);
+        found[i * count + k] = singles ? singles[place] : doubles[place];
+      }
+  for (int64_t k = 0; k < count; k++)
+    for (int64_t i = 0; i < rows; i++)
+      if (column[k] > row[i]) {
+        int64_t place = in_triangle(row[i], column[k]);
+        found[i * count + k] = singles ? singles[place] : doubles[place];
+      }
 }
 
 /* Fill in what areas know of the bare sheet: G and u0 at their rims, and their stiffness there.
@@ -840,11 +847,16 @@ static void press_by(const Field *f, const Contact *c, const Contact *hole, doub
   p->pressure = f->unit_kpa * c->each[PEAK] * p->profile;
 }
 
+/* Whether a contact may reach a point. */
+static int is_near(const Sizes *c, double x, double y) {
+  double dx = x - UNIT_M * c->as_is.each[X], dy = y - UNIT_M * c->as_is.each[Y];
+  return dx * dx + dy * dy < c->reach2;
+}
+
 /* Whether a contact reaches a point, and what it does there. */
 static int press(const Field *f, const Sizes *c, int is_ring, double x, double y,
                  int with_slopes, Press *p) {
-  double dx = x - UNIT_M * c->as_is.each[X], dy = y - UNIT_M * c->as_is.each[Y];
-  if (dx * dx + dy * dy >= c->reach2) return 0;
+  if (!is_near(c, x, y)) return 0;
   p->as_is.outline = outline_at(f, &c->as_is, x, y, with_slopes);
   p->wide = p->as_is.outline.t + c->wider / f->half_width_m;
   if (p->wide <= -1) return 0;
@@ -942,9 +954,11 @@ int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, co
   memset(by_enclosed, 0, size), memset(by_enclosed_kpa, 0, size);
   memset(by_share, 0, size), memset(by_pressure, 0, size);
   for (int64_t i = 0; i < n; i++) {
-    int there = 0;
+    int there = 0, is_moved = 0;
     double of_as_is = 0.0, as_is = 0.0, of_drawn = 0.0, drawn = 0.0, stronger = 0.0;
     double no_share = 1.0;
+    for (int64_t k = 0; k < count; k++) is_moved |= is_free[k] && is_near(contact + k, x[i], y[i]);
+    if (!is_moved) continue; /* by nothing that is free */
     for (int64_t k = 0; k < count; k++) {
       int is_ring = each[COLUMNS * k + HOLE] != 0 || index[COLUMNS * k + HOLE] >= 0;
       Press *p = pressed + there;

@@ -128,14 +128,20 @@ class ContactSearch:
         clearest = max(measured, key=lambda name: abs(self._dipoles[name]))
         of_sheets = sum(map(len, fitted.residuals.values()))  # companions come last
         for name, own in zip(measured, np.split(J[:of_sheets], len(measured)), strict=True):
-            sheet = self._fit.sheet(name)
-            by_area = sheet.spot_sensitivity(self._probes, fitted.solutions[name])
-            by_area *= (self._dipoles[name] / np.abs(sheet.bare_voltages))[:, None]
-            by_area = measured[name].weighted(by_area)
-            cross = own.T @ by_area
+            sheet, changes = self._fit.sheet(name), measured[name]
+            by_product = sheet.spot_sensitivity(self._probes, fitted.solutions[name])
+            over = changes.weight * self._dipoles[name] / np.abs(sheet.bare_voltages)
+            # A weighted signature of each spot is only needed along these, and its square.
+            beside = np.column_stack([own, fitted.residuals[name]])
+            rows, power = changes.less_nuisance(beside), abs(sheet.by_product) @ over**2
+            if changes.nuisance is not None:
+                along, share = changes.nuisance
+                rows = np.hstack([rows, along * np.sqrt(share * (2 - share))])
+            found = (sheet.by_product @ (over[:, None] * rows)).T @ by_product
+            cross, unexplained = found[: len(normal)], found[len(normal)] - aside @ found[: len(normal)]
             spanned = (cross * np.linalg.solve(normal, cross)).sum(axis=0)
-            power = np.maximum((by_area**2).sum(axis=0) - spanned, 1e-30)
-            unexplained = by_area.T @ fitted.residuals[name] - cross.T @ aside
+            off = (found[len(normal) + 1 :] ** 2).sum(axis=0)
+            power = np.maximum(power @ by_product**2 - off - spanned, 1e-30)
             needed = np.maximum(-unexplained / power, 0.0)
             gain += needed**2 * power
             area = needed if name == clearest else area

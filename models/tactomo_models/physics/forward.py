@@ -105,6 +105,10 @@ class ForwardModel(CompiledSheet):
         self._products, self._product_of = np.unique(
             np.sort(np.split(pair, 2), axis=0), axis=1, return_inverse=True
         )
+        voltages = np.arange(len(self._sign))
+        of_each = -self._sign, (self._product_of, voltages)
+        # (Q, M) adds up what goes with each of Q products, see `spot_sensitivity`
+        self.by_product = sp.csr_matrix(of_each, (self._products.shape[1], len(voltages)))
 
     def _index_triangles(self) -> None:
         """Corners, gradients and stiffness of the triangles that touch a pressable node."""
@@ -190,17 +194,17 @@ class ForwardModel(CompiledSheet):
         return Probes(nodes, mean @ self.bare.potentials[nodes], mean)
 
     def spot_sensitivity(self, probes: Probes, solution: Solution) -> FloatArray:
-        """Derivative (M, C) of the voltages by the conductivity of one square metre at each spot.
+        """Derivative of voltages by the conductivity of one square metre at each of C spots.
 
-        Unlike `jacobian` it looks anywhere, at the price of resolution: it is for finding where a
+        (Q, C) of voltages whose drive and measurement may change places: those of all are
+        `by_product.T` times these. Unlike `jacobian` it looks anywhere, at the price of resolution: it is for finding where a
         contact is missing in a solution, not for fitting it.
         """
         moved = self.bare.green.between(probes.nodes, solution.rim) @ solution.injected
         field = self._pair_matrix @ (probes.bare + probes.gradient @ moved).T
         x, y = np.split(field, 2, axis=1)  # (pairs, C) each
         one, other = self._products
-        product = x[one] * x[other] + y[one] * y[other]
-        return np.asarray(product[self._product_of] * -self._sign[:, None])
+        return np.asarray(x[one] * x[other] + y[one] * y[other])
 
     def bare_jacobian(self) -> FloatArray:
         """Jacobian of the unpressed sheet, (M, P)."""

@@ -102,11 +102,14 @@ class Changes:
 
     def weighted(self, changes: FloatArray) -> FloatArray:
         """Relative changes (M,) or (M, N) over their errors, less what may be no press's."""
-        over = (self.weight * changes.T).T
-        if self.nuisance is not None:
-            along, share = self.nuisance
-            over -= along @ (share * (along.T @ over).T).T
-        return over
+        return self.less_nuisance((self.weight * changes.T).T)
+
+    def less_nuisance(self, over: FloatArray) -> FloatArray:
+        """Weighted changes (M,) or (M, N) less what may be no press's."""
+        if self.nuisance is None:
+            return over
+        along, share = self.nuisance
+        return np.asarray(over - along @ (share * (along.T @ over).T).T)
 
     @property
     def misfit(self) -> float:

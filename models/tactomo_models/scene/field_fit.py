@@ -28,7 +28,7 @@ from tactomo_models.physics.compiled_sheet import Pressed, Solution
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scans.changes import Changes
 from tactomo_models.scans.companion_forces import SheetsAndCompanions
-from tactomo_models.scene.drawing import Drawing
+from tactomo_models.scene.drawing import Drawing, Slopes
 from tactomo_models.scene.parameters import PEAK
 from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import SheetResponse, responses_of
@@ -225,10 +225,7 @@ class FieldFit:
     def _pressed(self, name: Channel, drawing: Drawing, log_ratio: float) -> Pressed:
         """What presses on a sheet, as the sheet sees it."""
         response = self.responses[name]
-        share, pressure = drawing.share, drawing.pressure_kpa
-        if name == Channel.STRUCTURE:
-            share, pressure = drawing.enclosed, drawing.enclosed_kpa
-        share, pressure = _for_c(share), _for_c(pressure)
+        share, pressure = map(_for_c, _felt_by(name, _drawn(drawing)))
         exponent = response.exponent(log_ratio)
         return Pressed(drawing.nodes, share, pressure, log_ratio, response.compiled, exponent)
 
@@ -291,7 +288,7 @@ class FieldFit:
         slopes = drawing.slopes()
         sheets = []
         for name, changes in measured.items():
-            by_share, by_pressure = slopes[:2] if name == Channel.STRUCTURE else slopes[2:]
+            by_share, by_pressure = _felt_by(name, slopes)
             by_parameter = self.sheet(name).slopes(
                 fitted.solutions[name],
                 self._pressed(name, drawing, fitted.log_ratio),
@@ -328,32 +325,35 @@ class FieldFit:
         little field (Ammari & Kang, Springer 2004, polarisation tensors).
         """
         counts = [2 + other.slopes()[0].shape[1] for other in others]
-        ends = np.cumsum(counts)[:-1]
+        ends = np.cumsum(counts)
         drawings = [fitted.drawing, *others]
         nodes = np.unique(np.concatenate([each.nodes for each in drawings]))
         rows = [np.searchsorted(nodes, each.nodes) for each in drawings]
+        sizes = [len(each) for each in rows[1:]]
+        places = np.concatenate(rows[1:]), np.repeat(np.arange(len(others)), sizes)
         sheets = []
         for name, changes in measured.items():
             sheet = self.sheet(name)
-            before, by_ratio = np.ones(len(nodes)), np.zeros(len(nodes))
-            before[rows[0]], _, by_ratio[rows[0]] = self._conducting(
-                name, fitted.drawing, fitted.log_ratio
+            before, by_ratio = np.ones((len(nodes), 1)), np.zeros((len(nodes), 1))
+            before[rows[0], 0], _, by_ratio[rows[0], 0] = self._conducting(
+                name, [fitted.drawing], fitted.log_ratio
             )
+            after = np.ones((len(nodes), len(others)))
+            by_ratio_after = np.zeros_like(after)
+            found = self._conducting(name, others, fitted.log_ratio)
+            after[places], by_each, by_ratio_after[places] = found
+            factor = 2 * before / (before + after)
+            by_each *= factor[places] ** 2
             columns = np.zeros((len(nodes), sum(counts)))
-            for other, at, into in zip(
-                others, rows[1:], np.split(columns, ends, axis=1), strict=True
+            columns[:, ends - counts] = factor * (after - before)
+            columns[:, ends - 1] = factor**2 * by_ratio_after - by_ratio
+            of_each = np.split(by_each, np.cumsum(sizes)[:-1], axis=1)
+            for other, at, by, end, count in zip(
+                others, rows[1:], of_each, ends, counts, strict=True
             ):
-                conducting, by, by_ratio_after = self._conducting(name, other, fitted.log_ratio)
-                after = np.ones(len(nodes))
-                after[at] = conducting
-                slopes = other.slopes()
-                by_share, by_pressure = slopes[:2] if name == Channel.STRUCTURE else slopes[2:]
-                factor = 2 * before / (before + after)
-                into[:, 0] = factor * (after - before)
-                into[at, 1:-1] = by[0][:, None] * by_share + by[1][:, None] * by_pressure
-                into[at, -1] = by_ratio_after
-                into[:, 1:] *= (factor**2)[:, None]
-                into[:, -1] -= by_ratio
+                by_share, by_pressure = _felt_by(name, other.slopes())
+                into = by[0][:, None] * by_share + by[1][:, None] * by_pressure
+                columns[at, end - count + 1 : end - 1] = into
             moved = columns.any(axis=1)
             where = nodes[moved]
             onto = sheet.at_rest[where, None] * columns[moved]
@@ -369,17 +369,20 @@ class FieldFit:
             sheets.append(np.hstack(felt))
         return [
             Step(each[:, 0], each[:, 1:-1], each[:, -1])
-            for each in np.split(np.concatenate(sheets), ends, axis=1)
+            for each in np.split(np.concatenate(sheets), ends[:-1], axis=1)
         ]
 
     def _conducting(
-        self, name: Channel, drawing: Drawing, log_ratio: float
+        self, name: Channel, drawings: Sequence[Drawing], log_ratio: float
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Conductivity ratios (n,), slopes (2, n) by share and pressure, (n,) by the log ratio."""
-        pressed = self._pressed(name, drawing, log_ratio)
-        found, slopes = pressed.response.conductivity(
-            pressed.share, pressed.pressure_kpa, log_ratio
-        )
+        """Conductivity ratios (n,), slopes (2, n) by share and pressure, (n,) by the log ratio.
+
+        Of all drawings' nodes, one drawing after the other.
+        """
+        of_each = (_felt_by(name, _drawn(drawing)) for drawing in drawings)
+        share, pressure = (np.concatenate(each) for each in zip(*of_each, strict=True))
+        response = self.responses[name].compiled
+        found, slopes = response.conductivity(share, pressure, log_ratio)
         return found, slopes[:2], slopes[2]
 
     def refine(
@@ -466,6 +469,16 @@ def bounded_step(
     step = -np.linalg.solve(damped, gradient)
     step *= min(1.0, STEP_LIMIT / max(float(np.abs(step).max(initial=0.0)), 1e-12))
     return np.asarray(step)
+
+
+def _drawn(drawing: Drawing) -> Slopes:
+    """The four (n,) that a drawing's slopes are of."""
+    return drawing.enclosed, drawing.enclosed_kpa, drawing.share, drawing.pressure_kpa
+
+
+def _felt_by(name: Channel, four: Slopes) -> tuple[FloatArray, FloatArray]:
+    """Share and pressure as a sheet sees them, or their slopes."""
+    return four[:2] if name == Channel.STRUCTURE else four[2:]
 
 
 def _felt(weights: FloatArray, drawing: Drawing) -> FloatArray:
