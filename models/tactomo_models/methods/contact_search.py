@@ -24,7 +24,9 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.methods.account import Account, Frame
+from tactomo_models.physics.compiled_sheet import Solution
 from tactomo_models.physics.forward import ForwardModel, Probes
+from tactomo_models.scans.changes import Changes
 from tactomo_models.scene.field_fit import FieldFit
 from tactomo_models.scene.parameters import SIZE, SMALLEST_SIZE, UNIT_M, X, Y
 
@@ -128,21 +130,32 @@ class ContactSearch:
         clearest = max(measured, key=lambda name: abs(self._dipoles[name]))
         of_sheets = sum(map(len, fitted.residuals.values()))  # companions come last
         for name, own in zip(measured, np.split(J[:of_sheets], len(measured)), strict=True):
-            sheet, changes = self._fit.sheet(name), measured[name]
-            by_product = sheet.spot_sensitivity(self._probes, fitted.solutions[name])
-            over = changes.weight * self._dipoles[name] / np.abs(sheet.bare_voltages)
-            # A weighted signature of each spot is only needed along these, and its square.
-            beside = np.column_stack([own, fitted.residuals[name]])
-            rows, power = changes.less_nuisance(beside), abs(sheet.by_product) @ over**2
-            if changes.nuisance is not None:
-                along, share = changes.nuisance
-                rows = np.hstack([rows, along * np.sqrt(share * (2 - share))])
-            found = (sheet.by_product @ (over[:, None] * rows)).T @ by_product
-            cross, unexplained = found[: len(normal)], found[len(normal)] - aside @ found[: len(normal)]
+            residual = fitted.residuals[name]
+            beside = np.column_stack([own, residual])
+            found, square = self._signatures(name, fitted.solutions[name], measured[name], beside)
+            cross, unexplained = found[:-1], found[-1] - aside @ found[:-1]
             spanned = (cross * np.linalg.solve(normal, cross)).sum(axis=0)
-            off = (found[len(normal) + 1 :] ** 2).sum(axis=0)
-            power = np.maximum(power @ by_product**2 - off - spanned, 1e-30)
+            power = np.maximum(square - spanned, 1e-30)
             needed = np.maximum(-unexplained / power, 0.0)
             gain += needed**2 * power
             area = needed if name == clearest else area
         return gain, area
+
+    def _signatures(
+        self, name: Channel, solution: Solution, changes: Changes, beside: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Products of the weighted change by each spot's disc with `beside` (M, R), and its square.
+
+        Shapes (R, C) and (C,). The changes themselves, as many as voltages, are never made.
+        """
+        sheet = self._fit.sheet(name)
+        by_product = sheet.spot_sensitivity(self._probes, solution)
+        over = changes.weight * self._dipoles[name] / np.abs(sheet.bare_voltages)
+        rows = changes.less_nuisance(beside)
+        if changes.nuisance is not None:
+            along, share = changes.nuisance
+            rows = np.hstack([rows, along * np.sqrt(share * (2 - share))])
+        found = (sheet.by_product @ (over[:, None] * rows)).T @ by_product
+        found, less = np.split(found, [beside.shape[1]])
+        square = (abs(sheet.by_product) @ over**2) @ by_product**2 - (less**2).sum(axis=0)
+        return found, square

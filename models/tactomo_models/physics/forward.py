@@ -196,9 +196,9 @@ class ForwardModel(CompiledSheet):
     def spot_sensitivity(self, probes: Probes, solution: Solution) -> FloatArray:
         """Derivative of voltages by the conductivity of one square metre at each of C spots.
 
-        (Q, C) of voltages whose drive and measurement may change places: those of all are
-        `by_product.T` times these. Unlike `jacobian` it looks anywhere, at the price of resolution: it is for finding where a
-        contact is missing in a solution, not for fitting it.
+        Of voltages (Q, C) whose drive and measurement may change places: all of them have
+        `by_product.T` times these. Unlike `jacobian` it looks anywhere, at the price of resolution:
+        it is for finding where a contact is missing in a solution, not for fitting it.
         """
         moved = self.bare.green.between(probes.nodes, solution.rim) @ solution.injected
         field = self._pair_matrix @ (probes.bare + probes.gradient @ moved).T
