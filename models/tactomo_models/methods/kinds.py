@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from enum import StrEnum, auto
 
 import numpy as np
+from scipy.special import gammaln
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scene.parameters import (
@@ -75,6 +76,41 @@ def log_prior(kinds: Iterable[Kind]) -> float:
     for kind, count in counts.items():
         found += math.lgamma(TOLD * SHARES[kind] + count) - math.lgamma(TOLD * SHARES[kind])
     return found
+
+
+def marginals(log_ratios: FloatArray) -> FloatArray:
+    """How likely each of `SHARES` is of each of K contacts, whatever the others are.
+
+    What one contact may be depends on what the others are, as the kinds of a scene are drawn
+    together (`log_prior`): the sum over all that they may be, of which the prior knows the counts
+    alone.
+
+    Args:
+        log_ratios: (K, kinds) logarithms of likelihoods over any one of each contact; -inf where a
+            contact cannot be of a kind.
+    """
+    likely = np.exp(log_ratios - log_ratios.max(axis=1, keepdims=True))
+    count, prior = len(likely), TOLD * np.array([*SHARES.values()])
+    # By how many of the other contacts are of each kind; the last kind has what is left.
+    of_each = np.indices((count,) * (len(SHARES) - 1))
+    of_each = np.concatenate([of_each, [count - 1 - of_each.sum(axis=0)]])
+    pseudo = prior.reshape(-1, *(1,) * (len(SHARES) - 1)) + of_each
+    weight = np.where(
+        of_each[-1] >= 0, gammaln(np.maximum(pseudo, prior.min())).sum(axis=0), -np.inf
+    )
+    by_kind = np.exp(weight - weight.max(initial=-np.inf)) * pseudo
+    found = np.empty_like(likely)
+    for k in range(count):
+        ways = np.zeros(of_each.shape[1:])
+        ways[0, 0, 0] = 1.0
+        for others in np.delete(likely, k, axis=0):
+            more = others[-1] * ways
+            more[1:] += others[0] * ways[:-1]
+            more[:, 1:] += others[1] * ways[:, :-1]
+            more[:, :, 1:] += others[2] * ways[:, :, :-1]
+            ways = more / more.max()
+        found[k] = likely[k] * (by_kind * ways).sum(axis=(1, 2, 3))
+    return np.asarray(found / found.sum(axis=1, keepdims=True))
 
 
 def kind_of(contact: FloatArray) -> Kind:

@@ -6,12 +6,13 @@ evidence of both (`prediction`); what nobody has asked yet is as likely as befor
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from tactomo_models.arrays import FloatArray
-from tactomo_models.methods.kinds import Kind, as_kind, kind_of, log_prior
+import numpy as np
+
+from tactomo_models.arrays import BoolArray, FloatArray
+from tactomo_models.methods.kinds import SHARES, Kind, as_kind, kind_of, log_prior, marginals
 from tactomo_models.methods.prediction import Prediction
 from tactomo_models.scene.field_account import Alternative
 from tactomo_models.scene.parameters import EDGE
@@ -78,11 +79,6 @@ class Rival:
         is_likely = self.log_odds > (MAY_WIN if presses_alike else DOUBTFUL) or self.is_far
         return self.found is not None and not self.is_solved and is_likely
 
-    def of(self, contact: FloatArray) -> Alternative:
-        """The alternative that it is to a contact (COLUMNS,), at odds that a float holds."""
-        odds = math.exp(min(self.log_odds, 700))
-        return Alternative(odds, contact + self.difference, self.sigmas)
-
     def mean(self, log_odds: float) -> float:
         """The mean of log odds and those of other frames.
 
@@ -93,22 +89,59 @@ class Rival:
 
 Rivals = Mapping[Kind, Rival]
 
+KINDS = list(SHARES)
+MAX_LOG_ODDS, MIN_SHARE = 700.0, 1e-300  # what a float holds
 
-def unasked(k: int, contacts: FloatArray, sigmas: FloatArray, rivals: Rivals) -> list[Alternative]:
-    """Kinds of other peaks that one of the contacts (K, COLUMNS) has not been asked for."""
+
+def alternatives(
+    contacts: FloatArray,  # (K, COLUMNS)
+    sigmas: FloatArray,  # (K, COLUMNS) their standard uncertainties
+    rivals: Sequence[Rivals],
+    may_differ: BoolArray,  # (K,) contacts that have another peak if they are of another kind
+) -> list[list[Alternative]]:
+    """What else each contact may be, where it is one contact."""
     own = [kind_of(contact) for contact in contacts]
-    kinds = {Kind.EVEN, Kind.FALLING, Kind.RING} - {own[k], *rivals}
-    if own[k] is Kind.ROUNDED:
-        kinds -= {Kind.EVEN}
+    prior = _prior_odds(own)
+    log_odds = _log_odds(own, rivals, prior)
+    odds = np.exp(np.minimum(log_odds, MAX_LOG_ODDS))
+    likely = marginals(log_odds - prior)
+    found: list[list[Alternative]] = []
+    for k, mine in enumerate(rivals):
+        others: list[Alternative] = []
+        for place, kind in enumerate(SHARES):
+            if kind is own[k] or not odds[k, place] or not (kind in mine or may_differ[k]):
+                continue
+            contact, of_contact = as_kind(contacts[k], kind)[0], sigmas[k]
+            if kind in mine:
+                contact, of_contact = contacts[k] + mine[kind].difference, mine[kind].sigmas
+            marginal = likely[k, place] / max(likely[k, KINDS.index(own[k])], MIN_SHARE)
+            others.append(Alternative(odds[k, place], marginal, contact, of_contact))
+        found.append(others)
+    return found
+
+
+def _prior_odds(own: Sequence[Kind]) -> FloatArray:
+    """Logarithms (K, kinds) of how likely it is before any data that one contact is another."""
     now = log_prior(own)
-    return [
-        Alternative(
-            math.exp(log_prior([*own[:k], kind, *own[k + 1 :]]) - now),
-            as_kind(contacts[k], kind)[0],
-            sigmas,
-        )
-        for kind in sorted(kinds)
-    ]
+    return np.array(
+        [
+            [log_prior([*own[:k], kind, *own[k + 1 :]]) - now for kind in SHARES]
+            for k in range(len(own))
+        ]
+    ).reshape(-1, len(SHARES))
+
+
+def _log_odds(own: Sequence[Kind], rivals: Sequence[Rivals], prior: FloatArray) -> FloatArray:
+    """The same with the data; what nobody has asked yet is as likely as it is before."""
+    log_odds = np.full(prior.shape, -np.inf)
+    for k, mine in enumerate(rivals):
+        for place, kind in enumerate(SHARES):
+            if kind in mine:
+                log_odds[k, place] = mine[kind].log_odds
+            elif kind is not Kind.ROUNDED and (own[k], kind) != (Kind.ROUNDED, Kind.EVEN):
+                log_odds[k, place] = prior[k, place]
+        log_odds[k, KINDS.index(own[k])] = 0.0
+    return log_odds
 
 
 def choices(rivals: tuple[Rivals, ...], least: float) -> list[dict[int, Kind]]:

@@ -27,6 +27,7 @@ from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
 from tactomo_models.methods.prediction import Prediction, at_end, predict, with_kind
 from tactomo_models.methods.rivals import (
     Rivals,
+    alternatives,
     as_predicted,
     as_solved,
     choices,
@@ -34,7 +35,6 @@ from tactomo_models.methods.rivals import (
     opened,
     to_be_asked,
     turned,
-    unasked,
 )
 from tactomo_models.scans.companion_forces import with_outline_errors
 from tactomo_models.scans.stillness import Since, are_still
@@ -96,21 +96,13 @@ class Belief:
 
     @property
     def alternatives(self) -> list[list[Alternative]]:
-        """What else each contact may be, where it is one contact, at odds that a float holds.
+        """What else each contact may be.
 
-        What nobody has asked yet is as likely as it is before any data. Of what presses too lightly
-        for the graded sheet no kind has another peak.
+        Of what presses too lightly for the graded sheet no kind has another peak.
         """
         account, family = self.account, self.account.family
-        above = account.contacts[:, PEAK] > family.onset
-        may_differ = above & family.free[:, PEAK]
-        every: list[list[Alternative]] = []
-        for k, (contact, mine) in enumerate(zip(account.contacts, self.rivals, strict=True)):
-            others = [rival.of(contact) for rival in mine.values() if rival.is_one]
-            if may_differ[k]:
-                others += unasked(k, account.contacts, account.sigmas[k], mine)
-            every.append(others)
-        return every
+        may_differ = (account.contacts[:, PEAK] > family.onset) & family.free[:, PEAK]
+        return alternatives(account.contacts, account.sigmas, self.rivals, may_differ)
 
 
 class Search:

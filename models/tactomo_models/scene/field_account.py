@@ -58,7 +58,9 @@ class FieldAccount:
 class Alternative:
     """What else one contact may be."""
 
-    odds: float  # how likely, over what it is taken for
+    # how likely, over what it is taken for, if the others are what they are taken for
+    odds: float
+    marginal: float  # the same, whatever the others are
     contact: FloatArray  # (COLUMNS,) its parameters
     sigmas: FloatArray  # (COLUMNS,) their standard uncertainties
 
@@ -98,8 +100,9 @@ class FieldAccountant:
         each = family.split(fitted.parameters)
         owner = self._owners_of(shown, each)
         for k, others in enumerate(alternatives):
-            total = 1 + sum(one.odds for one in others)
-            likely = [one for one in others if one.odds > NEGLIGIBLE * total]
+            odds = [max(one.odds, one.marginal) for one in others]
+            least = NEGLIGIBLE * (1 + sum(odds))
+            likely = [one for one, of_it in zip(others, odds, strict=True) if of_it > least]
             if likely:
                 shown = self._mixed(shown, family, each[k], likely, np.flatnonzero(owner == k))
         return shown
@@ -200,7 +203,8 @@ class FieldAccountant:
     ) -> FieldAccount:
         """The mean over what a contact may be; uncertainties know how far that is apart."""
         odds = np.array([1.0, *(one.odds for one in likely)])
-        share = odds / odds.sum()
+        marginal = np.array([1.0, *(one.marginal for one in likely)])
+        share, marginal = odds / odds.sum(), marginal / marginal.sum()
         kinds = np.stack([contact, *(each.contact for each in likely)])
         alone = self._alone(family, kinds)
 
@@ -208,7 +212,7 @@ class FieldAccountant:
             return share @ (of - of[0])
 
         def spread(of: FloatArray) -> float:
-            return float(np.sqrt(share @ (of - share @ of) ** 2))
+            return float(np.sqrt(marginal @ (of - share @ of) ** 2))
 
         # The mean of a disc and a ring is a dent, which neither of them has.
         is_alike = (kinds[:, HOLE] > 0) == (contact[HOLE] > 0)
@@ -240,10 +244,12 @@ class FieldAccountant:
             of_peaks = family.unit_kpa * np.array([0.0, *(one.sigmas[PEAK] for one in likely)])
             # Whatever else it may be has a peak of its own uncertainty.
             by_peak = alone.slope * of_peaks
-            more = float(share @ by_peak**2)
+            more = float(marginal @ by_peak**2)
             own_sigmas = np.hypot(contacts.peak_magnitude_sigma[at], by_peak)
             sides = contacts.peak_magnitude_sides.copy()
-            sides[:, at] = _sides(share, alone.peak_magnitude, own_sigmas)
+            sides[:, at] = _sides(
+                marginal, alone.peak_magnitude, own_sigmas, share @ alone.peak_magnitude
+            )
             felt = np.array(contacts.felt, float)
             felt[at] = alone.peak_magnitude[kinds[:, EDGE].argmin()]
             contacts = replace(
@@ -464,8 +470,8 @@ class FieldAccountant:
         return np.asarray((apart / np.exp(each[:, SIZE])).argmin(axis=1))
 
 
-def _sides(share: FloatArray, means: FloatArray, sigmas: FloatArray) -> FloatArray:
-    """How far (2,) below and above the mean of normal distributions the bounds of 95 % are.
+def _sides(share: FloatArray, means: FloatArray, sigmas: FloatArray, told: float) -> FloatArray:
+    """How far (2,) below and above a value the bounds of 95 % of normal distributions are.
 
     In `ONE_SIDED_95`; shares, means and standard deviations are of each distribution, (n,).
     """
@@ -475,8 +481,8 @@ def _sides(share: FloatArray, means: FloatArray, sigmas: FloatArray) -> FloatArr
         middle = (least + most) / 2
         is_less = ndtr((middle[:, None] - means) / np.maximum(sigmas, 1e-12)) @ share < (0.05, 0.95)
         least, most = np.where(is_less, middle, least), np.where(is_less, most, middle)
-    bounds, mean = (least + most) / 2, share @ means
-    return np.asarray(np.maximum([mean - bounds[0], bounds[1] - mean], 0.0) / ONE_SIDED_95)
+    bounds = (least + most) / 2
+    return np.asarray(np.maximum([told - bounds[0], bounds[1] - told], 0.0) / ONE_SIDED_95)
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from pressed import contact, contacts
 from tactomo_models.arrays import FloatArray
-from tactomo_models.methods.kinds import SHARES, Kind, as_kind, as_one, kind_of, log_prior
+from tactomo_models.methods.kinds import (
+    SHARES,
+    Kind,
+    as_kind,
+    as_one,
+    kind_of,
+    log_prior,
+    marginals,
+)
 from tactomo_models.scene.parameters import E1, E2, PEAK, SIZE, UNIT_M, X, Y
 
 ONE = [Kind.EVEN, Kind.ROUNDED, Kind.RING, Kind.FALLING]
@@ -101,6 +110,35 @@ def test_contacts_of_a_scene_are_more_often_alike(kinds: list[Kind], random: Ran
         assert log_prior(kinds) < alone
     again = random.sample(kinds, len(kinds))
     assert log_prior(again) == pytest.approx(log_prior(kinds))
+
+
+@given(
+    st.integers(1, 4).flatmap(
+        lambda count: arrays(float, (count, len(SHARES)), elements=st.floats(-30, 30))
+    )
+)
+def test_what_one_contact_may_be_is_the_sum_over_all_that_the_others_may_be(
+    log_ratios: FloatArray,
+) -> None:
+    """Each choice of all kinds is as likely as the data and the prior have it."""
+    every = list(product(range(len(SHARES)), repeat=len(log_ratios)))
+    logs = np.array(
+        [
+            log_prior([list(SHARES)[kind] for kind in kinds])
+            + log_ratios[np.arange(len(kinds)), kinds].sum()
+            for kinds in every
+        ]
+    )
+    likely, expected = np.exp(logs - logs.max()), np.zeros(log_ratios.shape)
+    for kinds, each in zip(every, likely / likely.sum(), strict=True):
+        expected[np.arange(len(kinds)), kinds] += each
+    np.testing.assert_allclose(marginals(log_ratios), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_what_a_crowd_of_twelve_may_be_holds_what_a_float_holds() -> None:
+    log_ratios = np.full((12, len(SHARES)), -np.inf)
+    log_ratios[:, :2] = 0.0, 700.0
+    np.testing.assert_allclose(marginals(log_ratios), np.eye(len(SHARES))[[1] * 12], atol=1e-9)
 
 
 @given(st.lists(st.tuples(places, places, radii, elongations, angles), min_size=1, max_size=5))

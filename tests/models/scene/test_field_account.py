@@ -263,7 +263,7 @@ def test_another_account_that_is_as_likely_is_half_of_what_is_shown(sensor: Sens
     other, _ = explained(sensor, different)
     accounts = accountant(sensor)
     own, apart = accounts.account(field, data), accounts.account(other, data)
-    alternative = Alternative(1.0, different, np.zeros(COLUMNS))
+    alternative = Alternative(1.0, 1.0, different, np.zeros(COLUMNS))
     both = accounts.account(field, data, [[alternative]])
     for name in ("map", "structure", "pressure_kpa"):
         mean = (getattr(own, name) + getattr(apart, name)) / 2
@@ -285,7 +285,7 @@ def test_bounds_of_a_peak_are_those_of_all_that_it_may_be(sensor: Sensor, odds: 
     accounts = accountant(sensor)
     own = accounts.account(field, data).contacts
     apart = accounts.account(explained(sensor, different)[0], data).contacts
-    alternative = Alternative(odds, different, np.zeros(COLUMNS))
+    alternative = Alternative(odds, odds, different, np.zeros(COLUMNS))
     both = accounts.account(field, data, [[alternative]]).contacts
     assert own is not None
     assert apart is not None
@@ -306,7 +306,7 @@ def test_the_pressure_under_an_even_contact_is_even_where_a_ring_is_as_likely(
 ) -> None:
     """No donut: the numbers know of the ring, the picture is of what the contact is taken for."""
     field, data = explained(sensor, KINDS["flat"])
-    ring = Alternative(1.0, other_of(KINDS["ring"], peak=0.2), np.zeros(COLUMNS))
+    ring = Alternative(1.0, 1.0, other_of(KINDS["ring"], peak=0.2), np.zeros(COLUMNS))
     accounts = accountant(sensor)
     account = accounts.account(field, data, [[ring]])
     own = accounts.account(field, data)
