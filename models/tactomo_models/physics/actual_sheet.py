@@ -19,15 +19,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.sparse as sp
 import skfem
 from tactomo_protocol import Channel
 
-from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.physics.artifact import GREEN_DTYPE, INVERSE_REFINEMENTS, MODEL_ERROR
 from tactomo_models.physics.bare_sheet import (
     BareSheet,
     assemble_sheet,
     electrode_fields,
+    electrode_terms,
     scan_voltages,
     solve_bare_sheet,
     transfer_of,
@@ -63,6 +65,7 @@ class _Shape:
     mesh: SheetMesh
     conductivity: FloatArray
     impedance: FloatArray
+    system: sp.csc_matrix
     contacts: FloatArray
     fields: FloatArray
     voltages: FloatArray
@@ -192,13 +195,11 @@ class SheetEstimator:
         mesh = self._moved(places)
         conductivity, impedance = np.exp(modes @ self._modes), np.exp(impedances)
         triangles = conductivity[mesh.mesh.t].mean(axis=0)
-        fields = electrode_fields(
-            self._description,
-            assemble_sheet(self._description, mesh, triangles, impedance),
-        )
-        bare = assemble_sheet(self._description, mesh, np.zeros(len(triangles)), impedance)
+        system = assemble_sheet(self._description, mesh, triangles, impedance)
+        fields = electrode_fields(self._description, system)
+        contacts = electrode_terms(self._description, mesh, impedance) @ fields
         voltages = scan_voltages(self._description, transfer_of(self._description, fields))
-        return _Shape(mesh, conductivity, impedance, bare @ fields, fields, voltages)
+        return _Shape(mesh, conductivity, impedance, system, contacts, fields, voltages)
 
     def _moved(self, places: FloatArray) -> SheetMesh:
         """The mesh with electrodes off their places, by units of DISPLACED_M along the rim."""
@@ -210,13 +211,12 @@ class SheetEstimator:
         """Derivatives (M, N) of the voltages: dR = -u^T dA u with the fields u."""
         electrodes = self._description.electrode_count
         first, second = np.triu_indices(electrodes - 1)
-        columns = [self._by_modes(shape, first, second)]
+        columns = [self._by_modes(shape)]
         nudge = 0.1  # of a millimetre, by which all electrodes move at once: none meets another
         triangles = shape.conductivity[shape.mesh.mesh.t].mean(axis=0)
         moved = self._moved(parameters[-electrodes:] + nudge)
-        change = assemble_sheet(self._description, moved, triangles, shape.impedance)
-        change -= assemble_sheet(self._description, shape.mesh, triangles, shape.impedance)
-        by_place = change @ shape.fields / nudge
+        changed = assemble_sheet(self._description, moved, triangles, shape.impedance)
+        by_place = (changed - shape.system) @ shape.fields / nudge
         for currents in (-shape.contacts, by_place):
             each = []
             for rows in self._around:
@@ -228,11 +228,14 @@ class SheetEstimator:
         transfer[first, second] = transfer[second, first] = slopes
         return scan_voltages(self._description, transfer)
 
-    def _by_modes(self, shape: _Shape, first: IntArray, second: IntArray) -> FloatArray:
+    def _by_modes(self, shape: _Shape) -> FloatArray:
         """Derivatives (pairs, modes) of transfer resistances by the modes of conductivity."""
         corners = shape.mesh.mesh.t
         hats, area = hat_gradients(shape.mesh.mesh.p[:, corners], shape.mesh.stretch)
         field = np.einsum("dct,cta->adt", hats, shape.fields[corners])  # (L - 1, 2, T)
         weight = (shape.conductivity * self._modes)[:, corners].mean(axis=1) * area
-        products = (field[first] * field[second]).sum(axis=1)
+        # Of pairs in the order of `np.triu_indices`.
+        products = np.concatenate(
+            [x * field[k:, 0] + y * field[k:, 1] for k, (x, y) in enumerate(field)]
+        )
         return np.asarray(-products @ weight.T)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,12 +18,11 @@ import scipy.sparse.linalg as spla
 import skfem
 from numpy.typing import DTypeLike
 from scipy.spatial import cKDTree
-from skfem.helpers import dot, grad, mul
 from threadpoolctl import threadpool_limits
 
 from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.physics.greens import GreensFunction, PackedGreensFunction
-from tactomo_models.physics.mesh import SheetMesh, hat_gradients
+from tactomo_models.physics.mesh import SheetMesh, assembled, hat_gradients
 from tactomo_models.sensor.description import SensorDescription
 
 NEAREST = 24  # triangles by their middles, among which a place's own is: refined ones are smaller
@@ -164,16 +162,6 @@ def transfer_of(description: SensorDescription, fields: FloatArray) -> FloatArra
     return transfer
 
 
-@skfem.BilinearForm  # type: ignore[untyped-decorator]
-def _conduction(u: Any, v: Any, w: Any) -> Any:
-    return w["conductivity"] * dot(grad(u), grad(v))
-
-
-@skfem.BilinearForm  # type: ignore[untyped-decorator]
-def _stretched_conduction(u: Any, v: Any, w: Any) -> Any:
-    return dot(mul(w["conductivity"], grad(u)), grad(v))
-
-
 def assemble_sheet(
     description: SensorDescription,  # the sensor
     sheet: SheetMesh,  # its mesh of N nodes and T triangles
@@ -190,16 +178,19 @@ def assemble_sheet(
         (N + L - 1, N + L - 1), symmetric positive definite, of the potentials of the nodes and of
         all electrodes but the last.
     """
+    mesh, terms = sheet.mesh, electrode_terms(description, sheet, impedance)
+    gradient, area = hat_gradients(mesh.p[:, mesh.t], sheet.stretch)
+    products = np.einsum("dit,djt->tij", gradient, gradient)
+    stiffness = (conductivity * area)[:, None, None] * products
+    return terms + assembled(stiffness, mesh.t.T, terms.shape[0]).tocsc()
+
+
+def electrode_terms(
+    description: SensorDescription, sheet: SheetMesh, impedance: FloatArray | None = None
+) -> sp.csc_matrix:
+    """What electrodes add to the sheet alone; arguments and shape as of `assemble_sheet`."""
     mesh = sheet.mesh
     nodes, electrodes = mesh.p.shape[1], description.electrode_count
-    basis = skfem.Basis(mesh, skfem.ElementTriP1())
-    if sheet.stretch is None:
-        stiffness = _conduction.assemble(basis, conductivity=conductivity[:, None])
-    else:
-        inverse = np.linalg.inv(sheet.stretch)
-        tensor = (conductivity * np.linalg.det(sheet.stretch))[:, None, None] * (inverse @ inverse)
-        tensor = np.moveaxis(tensor, 0, 2)[..., None]
-        stiffness = _stretched_conduction.assemble(basis, conductivity=tensor)
     # Contact impedance, made relative to the sheet: an extra length of conductor, in metres.
     contact_m = np.full(
         electrodes, description.electrodes.contact_impedance_ohm_m * description.sheet_conductance_s
@@ -208,11 +199,11 @@ def assemble_sheet(
         contact_m *= impedance
     rows, columns, values = [], [], []  # of the electrodes' terms
     lengths = np.zeros(electrodes)
-    for index, facets in enumerate(sheet.electrode_facets):
-        ends = mesh.facets[:, facets]
+    for index, edges in enumerate(sheet.electrode_edges):
+        *ends, triangles = edges.T
         edge = mesh.p[:, ends[0]] - mesh.p[:, ends[1]]
         if sheet.stretch is not None:
-            edge = np.einsum("fij,jf->if", sheet.stretch[mesh.f2t[0, facets]], edge)
+            edge = np.einsum("fij,jf->if", sheet.stretch[triangles], edge)
         length = np.linalg.norm(edge, axis=0)
         lengths[index] = length.sum()
         for i, j in ((0, 0), (1, 1), (0, 1), (1, 0)):
@@ -246,8 +237,7 @@ def assemble_sheet(
     values.append(lengths / contact_m)
     size = nodes + electrodes
     terms = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    stiffness.resize(size, size)
-    return (stiffness + sp.csr_matrix(terms, (size, size)))[:-1, :-1].tocsc()
+    return sp.csc_matrix(terms, (size, size))[:-1, :-1]
 
 
 def _map_weights(description: SensorDescription, mesh: skfem.MeshTri) -> sp.csr_matrix:

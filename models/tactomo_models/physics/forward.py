@@ -32,7 +32,7 @@ from scipy.spatial import Delaunay
 from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.physics.bare_sheet import BareSheet, scan_voltages, volts_per_unit
 from tactomo_models.physics.compiled_sheet import CompiledSheet, Solution, positions
-from tactomo_models.physics.mesh import hat_gradients
+from tactomo_models.physics.mesh import assembled, hat_gradients
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.sheet import Ring
 
@@ -210,12 +210,6 @@ class ForwardModel(CompiledSheet):
         """Jacobian of the unpressed sheet, (M, P)."""
         unpressed = self.solve(np.zeros(len(self.bare.pressable)))
         return self.jacobian(unpressed, np.arange(len(self.bare.pressable)))
-
-
-def assembled(stiffness: FloatArray, corners: IntArray, nodes: int) -> sp.csr_matrix:
-    """Sum the (t, 3, 3) of triangles into one matrix on all nodes."""
-    rows, columns = np.repeat(corners, 3, axis=1), np.tile(corners, (1, 3))
-    return sp.csr_matrix((stiffness.ravel(), (rows.ravel(), columns.ravel())), (nodes, nodes))
 
 
 def _lists(owner: IntArray, member: IntArray, owners: int, fill: int) -> IntArray:

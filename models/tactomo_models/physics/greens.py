@@ -13,6 +13,8 @@ Source: Przemieniecki, "Matrix structural analysis of substructures", AIAA J. 1 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -67,27 +69,40 @@ class GreensFunction:
         separators = np.flatnonzero(separates)
         condensed = own[separators][:, separators].toarray()
         condensed -= _onto_rim(system[outside][:, outside], coupling[:, separators])
-        size = len(separators)
-        inner: list[IntArray] = []
-        inverses: list[FloatArray] = []
-        weights: list[sp.csr_matrix] = []
+        self._separators = separators
+        self._parts: list[_Box] = []
         for number in np.unique(box[~separates]):
             members = np.flatnonzero((box == number) & ~separates)
             inverse = np.linalg.inv(own[members][:, members].toarray())
             towards = own[members][:, separators].tocsc()
             seen = np.flatnonzero(np.diff(towards.indptr))
             edge = towards[:, seen].toarray()
-            weight = -inverse @ edge
-            condensed[np.ix_(seen, seen)] += edge.T @ weight
-            inner.append(members)
-            inverses.append(inverse)
-            weights.append(_columns_at(weight, seen, size))
-        order = np.argsort(np.concatenate([*inner, separators]))
-        zero = sp.csr_matrix((size, size))
-        self._within = sp.block_diag([*inverses, zero], "csr")[order][:, order].tocsr()
-        self._weights = sp.vstack([*weights, sp.identity(size, format="csr")]).tocsr()[order]
+            part = _Box(members, seen, inverse, -inverse @ edge)
+            condensed[np.ix_(seen, seen)] += edge.T @ part.weight
+            self._parts.append(part)
         inverse = np.linalg.inv(condensed)
         self._between = (inverse + inverse.T) / 2
+
+    @cached_property
+    def _in_order(self) -> IntArray:
+        """(S,) where each node stands among the members of all boxes and the separators."""
+        return np.argsort(
+            np.concatenate([*(part.members for part in self._parts), self._separators])
+        )
+
+    @cached_property
+    def _within(self) -> sp.csr_matrix:
+        """(S, S) what a box sees of itself."""
+        order, size = self._in_order, len(self._separators)
+        blocks = [*(part.inverse for part in self._parts), sp.csr_matrix((size, size))]
+        return sp.block_diag(blocks, "csr")[order][:, order].tocsr()
+
+    @cached_property
+    def _weights(self) -> sp.csr_matrix:
+        """(S, separators) by which each node sees the separators."""
+        size = len(self._separators)
+        weights = [_columns_at(part.weight, part.seen, size) for part in self._parts]
+        return sp.vstack([*weights, sp.identity(size, format="csr")]).tocsr()[self._in_order]
 
     def between(self, rows: IntArray, columns: IntArray) -> FloatArray:
         """Potentials (r, c) at some of the nodes for unit currents into others, by their places."""
@@ -98,16 +113,34 @@ class GreensFunction:
 
     def packed(self, dtype: DTypeLike = np.float64) -> PackedGreensFunction:
         """All of it, of which a block is a look-up: up to hundreds of megabytes."""
-        onto = (self._weights @ self._between).T
-        size = len(onto.T)
+        size = len(self._in_order)
+        onto = np.empty((len(self._separators), size))
+        onto[:, self._separators] = self._between
+        for part in self._parts:
+            onto[:, part.members] = self._between[:, part.seen] @ part.weight.T
         lower = np.empty(size * (size + 1) // 2, dtype)
-        start = 0
-        for block in np.array_split(np.arange(size), 12):  # a few megabytes each
-            rows = self._within[block].toarray() + self._weights[block] @ onto
-            for place, row in zip(block, rows, strict=True):
+
+        def keep(places: IntArray, rows: FloatArray) -> None:
+            for place, row in zip(places.tolist(), rows, strict=True):
+                start = place * (place + 1) // 2
                 lower[start : start + place + 1] = row[: place + 1]
-                start += place + 1
+
+        keep(self._separators, onto)
+        for part in self._parts:
+            rows = part.weight @ onto[part.seen]
+            rows[:, part.members] += part.inverse
+            keep(part.members, rows)
         return PackedGreensFunction(lower)
+
+
+@dataclass(frozen=True)
+class _Box:
+    """Nodes that see others through the separators around them alone."""
+
+    members: IntArray  # (m,) places of the nodes
+    seen: IntArray  # (k,) separators around them
+    inverse: FloatArray  # (m, m) A_ii^-1
+    weight: FloatArray  # (m, k) W_i
 
 
 def _boxes(points: FloatArray) -> IntArray:

@@ -9,6 +9,7 @@ an electrode is a whole number of edges.
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 import shapely
 import skfem
 from scipy.spatial import Delaunay
@@ -39,7 +40,9 @@ class SheetMesh:
     """A meshed sheet."""
 
     mesh: skfem.MeshTri  # scikit-fem triangles, coordinates in metres
-    electrode_facets: tuple[IntArray, ...]  # per electrode, the boundary facets it covers
+    # per electrode, the (n, 3) edges of the rim that it covers: both ends, and whose edge it is of
+    # all triangles
+    electrode_edges: tuple[IntArray, ...]
     # per pad, its electrode's number; (n,) triangles that it touches, and (n, 3, 3) integrals of
     # the products of their hat functions over what it covers, of the triangle's area
     pads: tuple[tuple[int, Pad, IntArray, FloatArray], ...] = ()
@@ -321,23 +324,30 @@ def hat_gradients(
     return on_surface, area * np.linalg.det(stretch)
 
 
+def assembled(stiffness: FloatArray, corners: IntArray, nodes: int) -> sp.csr_matrix:
+    """Sum the (t, 3, 3) of triangles into one matrix on all nodes."""
+    rows, columns = np.repeat(corners, 3, axis=1), np.tile(corners, (1, 3))
+    return sp.csr_matrix((stiffness.ravel(), (rows.ravel(), columns.ravel())), (nodes, nodes))
+
+
 def with_electrodes(mesh: skfem.MeshTri, description: SensorDescription) -> SheetMesh:
     """Find what each electrode covers, on a mesh with nodes at the electrodes' ends."""
     outline = description.sheet.outline
     facets = mesh.boundary_facets()
-    middle = mesh.p[:, mesh.facets[:, facets]].mean(axis=1)  # (2, facets)
+    edges = np.vstack([mesh.facets[:, facets], mesh.f2t[0, facets]]).T
+    middle = mesh.p[:, edges[:, :2]].mean(axis=2)  # (2, edges)
     rings, along = outline.locate(middle.T)
     found, pads = [], []
     for number, electrode in enumerate(description.placed_electrodes):
         if isinstance(electrode, Pad):
-            found.append(facets[:0])
+            found.append(edges[:0])
             pads.append((number, electrode, *_under(mesh, electrode)))
             continue
         length_m = outline.lengths_m[electrode.ring]
         off = np.abs((along - electrode.middle_m + length_m / 2) % length_m - length_m / 2)
-        # A hair less than half: a facet may begin where the electrode ends.
+        # A hair less than half: an edge may begin where the electrode ends.
         on = (rings == electrode.ring) & (off < (1 - 1e-9) * electrode.length_m / 2)
-        found.append(facets[on])
+        found.append(edges[on])
     stretch = None
     if description.stretching is not None:
         hats = np.stack(part_middles(STRETCH_PIECES))

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import scipy.sparse as sp
 
 from tactomo_models.arrays import FloatArray, IntArray
-from tactomo_models.physics.forward import ForwardModel, assembled
+from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.physics.mesh import assembled
 
 
 @dataclass(frozen=True)

@@ -48,9 +48,9 @@ def disc(width: float, count: int, share: float, first_deg: float, nodes: int) -
     return sensor({"shape": "disc", "width_m": width}, electrodes, nodes)
 
 
-def facet_lengths(sheet: SheetMesh, facets: IntArray) -> FloatArray:
-    ends = sheet.mesh.facets[:, facets]
-    return np.asarray(np.linalg.norm(sheet.mesh.p[:, ends[0]] - sheet.mesh.p[:, ends[1]], axis=0))
+def edge_lengths(sheet: SheetMesh, edges: IntArray) -> FloatArray:
+    ends = sheet.mesh.p[:, edges[:, :2]]
+    return np.asarray(np.linalg.norm(ends[..., 0] - ends[..., 1], axis=0))
 
 
 def triangle_areas(sheet: SheetMesh) -> FloatArray:
@@ -71,11 +71,11 @@ def check(description: SensorDescription) -> SheetMesh:
     areas = triangle_areas(sheet)
     assert areas.min() > 0
     assert areas.sum() == pytest.approx(rim_area(sheet), rel=ROUNDING)  # no fold, no overlap
-    taken = np.concatenate(sheet.electrode_facets)
-    assert len(set(taken.tolist())) == len(taken)
-    for ends, facets in zip(description.electrode_ends_m, sheet.electrode_facets, strict=True):
+    taken = np.concatenate(sheet.electrode_edges)[:, :2]
+    assert len({frozenset(ends) for ends in taken.tolist()}) == len(taken)
+    for ends, edges in zip(description.electrode_ends_m, sheet.electrode_edges, strict=True):
         chord = math.dist(*ends)
-        covered = facet_lengths(sheet, facets).sum()
+        covered = edge_lengths(sheet, edges).sum()
         if description.sheet.shape == "rectangle":
             assert covered == pytest.approx(chord, rel=1e-6)
         else:  # the rim is a polygon: between the chord and the arc
@@ -128,7 +128,7 @@ def test_every_map_node_of_a_rectangle_is_a_mesh_node(paper: SensorDescription) 
 def test_triangles_are_refined_at_electrode_ends(paper: SensorDescription) -> None:
     coarse, fine = (mesh_sheet(paper, refinements=n) for n in (0, 3))
     smallest = [
-        min(facet_lengths(sheet, facets).min() for facets in sheet.electrode_facets)
+        min(edge_lengths(sheet, edges).min() for edges in sheet.electrode_edges)
         for sheet in (coarse, fine)
     ]
     assert smallest[0] == pytest.approx(8 * smallest[1])

@@ -76,9 +76,9 @@ def test_the_rim_is_followed(name: str) -> None:
     assert area_of(sheet.mesh).sum() == pytest.approx(outline.polygon.area, rel=1e-3)
     rim = sheet.mesh.p[:, sheet.mesh.boundary_nodes()]
     assert np.abs(outline.depth(*rim)).max() < 1e-4
-    for facets in sheet.electrode_facets:
-        ends = sheet.mesh.p[:, sheet.mesh.facets[:, facets]]
-        length = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=0).sum()
+    for edges in sheet.electrode_edges:
+        ends = sheet.mesh.p[:, edges[:, :2]]
+        length = np.linalg.norm(ends[..., 0] - ends[..., 1], axis=0).sum()
         assert length == pytest.approx(sensor.electrodes.length_m, rel=1e-2)
 
 
@@ -114,8 +114,8 @@ def test_a_polygon_of_any_geometry(corners: list[float], hole: float, turn: floa
     sheet = mesh_sheet(sensor, refinements=1)
     assert area_of(sheet.mesh).min() > 0
     assert area_of(sheet.mesh).sum() == pytest.approx(sensor.sheet.outline.polygon.area, rel=2e-3)
-    taken = np.concatenate(sheet.electrode_facets)
-    assert len(set(taken.tolist())) == len(taken) > 0
+    taken = np.concatenate(sheet.electrode_edges)[:, :2]
+    assert len({frozenset(ends) for ends in taken.tolist()}) == len(taken) > 0
     transfer = transfer_resistances(sensor, sheet, np.ones(sheet.mesh.t.shape[1]))
     voltages = scan_voltages(sensor, transfer)
     assert np.isfinite(voltages).all()

@@ -56,7 +56,7 @@ def test_a_sheet_stretched_along_one_side_is_the_longer_sheet(small: SensorDescr
     """Node for node: electrodes on the long sides grow with it."""
     sheet = mesh_sheet(on_surface(small, along(1.5, 1.0)))
     points = sheet.mesh.p * np.array([[1.5], [1.0]])
-    longer = SheetMesh(skfem.MeshTri(points, sheet.mesh.t), sheet.electrode_facets)
+    longer = SheetMesh(skfem.MeshTri(points, sheet.mesh.t), sheet.electrode_edges)
     even = np.ones(sheet.mesh.t.shape[1])
     expected = transfer_resistances(small, longer, even)
     assert transfer_resistances(small, sheet, even) == pytest.approx(expected, rel=1e-9)
