@@ -337,6 +337,7 @@ def test_a_slow_subscriber_slows_nobody(desk: zenoh.Session, start: Start, conne
     stalled = connect(zmq.SUB, running.address, topic("left", "map"))
     wait_until(lambda: stalled.poll(0), meanwhile=put, step_s=0.02)  # and reads no more
     healthy = connect(zmq.SUB, running.address, topic("left", "map"))
+    wait_until(lambda: healthy.poll(0), meanwhile=put, step_s=0.02)  # before, it may not be heard
     for _ in range(600):  # 384 MB: more than any buffer holds
         put()
         assert healthy.poll(PATIENCE_S * 1000)

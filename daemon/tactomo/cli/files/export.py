@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 
 import typer
-from tactomo_client import Contact
-from tactomo_client.schema import table_row
 
 from tactomo.cli.files.recorded_frames import (
     FromOption,
@@ -255,17 +253,19 @@ FRAME_COLUMNS: Final = (
     "flags",
     "age_s",
 )
-CONTACT_COLUMNS: Final = tuple(table_row(Contact(0, 0.0, 0.0, 0.0)))
 ARRAY_COLUMNS: Final = {"magnitude_sigma": "contact_sigma", "frame": "contact_mount_frame"}
 """Columns whose array in the .npz of `tactomo reconstruct` is not named `contact_` and theirs."""
 
 
 def write_contacts(moments: Iterable[Moment], output: IO[bytes]) -> int:
     """Write the contacts of frames; return how many frames there were."""
-    count = 0
+    from tactomo_client import Contact
+    from tactomo_client.schema import table_row
+
+    columns, count = tuple(table_row(Contact(0, 0.0, 0.0, 0.0))), 0
     text = io.TextIOWrapper(output, encoding="utf-8", newline="")
     writer = csv.writer(text)
-    writer.writerow([*FRAME_COLUMNS, *CONTACT_COLUMNS])
+    writer.writerow([*FRAME_COLUMNS, *columns])
     for time_s, frame, age_s in moments:
         count += 1
         start = [
@@ -275,7 +275,7 @@ def write_contacts(moments: Iterable[Moment], output: IO[bytes]) -> int:
             age_s,
         ]
         for contact in frame.contacts or (None,):
-            cells = dict.fromkeys(CONTACT_COLUMNS, "") if contact is None else table_row(contact)
+            cells = dict.fromkeys(columns, "") if contact is None else table_row(contact)
             writer.writerow([*start, *cells.values()])
     text.detach()  # flushes it; the file stays open
     return count
