@@ -266,9 +266,10 @@ static int64_t in_triangle(int64_t row, int64_t column) {
   return more * (more + 1) / 2 + row + column - more;
 }
 
-static double green_at(const Sheet *s, int64_t row, int64_t column) {
+/* An entry of such a matrix that is given in either precision. */
+static double entry_of(const float *singles, const double *doubles, int64_t row, int64_t column) {
   int64_t place = in_triangle(row, column);
-  return s->green_single ? s->green_single[place] : s->green_double[place];
+  return singles ? singles[place] : doubles[place];
 }
 
 /* A block (rows, count) of a symmetric matrix whose lower triangle is given in either precision:
@@ -277,16 +278,12 @@ void block_of(const float *singles, const double *doubles, int64_t rows, const i
               int64_t count, const int64_t *column, double *found) {
   for (int64_t i = 0; i < rows; i++)
     for (int64_t k = 0; k < count; k++)
-      if (column[k] <= row[i]) {
-        int64_t place = in_triangle(row[i], column[k]);
-        found[i * count + k] = singles ? singles[place] : doubles[place];
-      }
+      if (column[k] <= row[i])
+        found[i * count + k] = entry_of(singles, doubles, row[i], column[k]);
   for (int64_t k = 0; k < count; k++)
     for (int64_t i = 0; i < rows; i++)
-      if (column[k] > row[i]) {
-        int64_t place = in_triangle(row[i], column[k]);
-        found[i * count + k] = singles ? singles[place] : doubles[place];
-      }
+      if (column[k] > row[i])
+        found[i * count + k] = entry_of(singles, doubles, row[i], column[k]);
 }
 
 /* Fill in what areas know of the bare sheet: G and u0 at their rims, and their stiffness there.
@@ -314,7 +311,9 @@ static int know(const Sheet *s, const double *given, Areas *a) {
     memcpy(row + r, s->potentials + node[i] * F, sizeof(double) * F);
     if (given) memcpy(row, given + i * r, sizeof(double) * r);
     for (int64_t j = 0; j < r && !given; j++) /* symmetric: looked up once, along its rows */
-      if (node[j] <= node[i]) row[j] = a->both[j * width + i] = green_at(s, node[i], node[j]);
+      if (node[j] <= node[i])
+        row[j] = a->both[j * width + i] =
+            entry_of(s->green_single, s->green_double, node[i], node[j]);
   }
   a->is_known = 1;
   free(node), forget(&bare);

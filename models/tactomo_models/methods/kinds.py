@@ -92,24 +92,24 @@ def marginals(log_ratios: FloatArray) -> FloatArray:
     likely = np.exp(log_ratios - log_ratios.max(axis=1, keepdims=True))
     count, prior = len(likely), TOLD * np.array([*SHARES.values()])
     # By how many of the other contacts are of each kind; the last kind has what is left.
-    of_each = np.indices((count,) * (len(SHARES) - 1))
-    of_each = np.concatenate([of_each, [count - 1 - of_each.sum(axis=0)]])
-    pseudo = prior.reshape(-1, *(1,) * (len(SHARES) - 1)) + of_each
+    of_each = np.indices((count,) * (len(SHARES) - 1)).reshape(len(SHARES) - 1, -1)
+    of_each = np.vstack([of_each, count - 1 - of_each.sum(axis=0)])
+    one_more = count ** np.arange(len(SHARES) - 1)[::-1]  # where a count stands that is larger by 1
+    pseudo = prior[:, None] + of_each
     weight = np.where(
         of_each[-1] >= 0, gammaln(np.maximum(pseudo, prior.min())).sum(axis=0), -np.inf
     )
     by_kind = np.exp(weight - weight.max(initial=-np.inf)) * pseudo
     found = np.empty_like(likely)
     for k in range(count):
-        ways = np.zeros(of_each.shape[1:])
-        ways[0, 0, 0] = 1.0
+        ways = np.zeros(of_each.shape[1])
+        ways[0] = 1.0
         for others in np.delete(likely, k, axis=0):
             more = others[-1] * ways
-            more[1:] += others[0] * ways[:-1]
-            more[:, 1:] += others[1] * ways[:, :-1]
-            more[:, :, 1:] += others[2] * ways[:, :, :-1]
+            for step, ratio in zip(one_more, others, strict=False):
+                more[step:] += ratio * ways[:-step]
             ways = more / more.max()
-        found[k] = likely[k] * (by_kind * ways).sum(axis=(1, 2, 3))
+        found[k] = likely[k] * (by_kind @ ways)
     return np.asarray(found / found.sum(axis=1, keepdims=True))
 
 

@@ -108,12 +108,13 @@ def alternatives(
     found: list[list[Alternative]] = []
     for k, mine in enumerate(rivals):
         others: list[Alternative] = []
-        for place, kind in enumerate(SHARES):
+        for place, kind in enumerate(KINDS):
             if kind is own[k] or not odds[k, place] or not (kind in mine or may_differ[k]):
                 continue
-            contact, of_contact = as_kind(contacts[k], kind)[0], sigmas[k]
             if kind in mine:
                 contact, of_contact = contacts[k] + mine[kind].difference, mine[kind].sigmas
+            else:
+                contact, of_contact = as_kind(contacts[k], kind)[0], sigmas[k]
             marginal = likely[k, place] / max(likely[k, KINDS.index(own[k])], MIN_SHARE)
             others.append(Alternative(odds[k, place], marginal, contact, of_contact))
         found.append(others)
@@ -125,17 +126,17 @@ def _prior_odds(own: Sequence[Kind]) -> FloatArray:
     now = log_prior(own)
     return np.array(
         [
-            [log_prior([*own[:k], kind, *own[k + 1 :]]) - now for kind in SHARES]
+            [log_prior([*own[:k], kind, *own[k + 1 :]]) - now for kind in KINDS]
             for k in range(len(own))
         ]
-    ).reshape(-1, len(SHARES))
+    ).reshape(-1, len(KINDS))
 
 
 def _log_odds(own: Sequence[Kind], rivals: Sequence[Rivals], prior: FloatArray) -> FloatArray:
     """The same with the data; what nobody has asked yet is as likely as it is before."""
     log_odds = np.full(prior.shape, -np.inf)
     for k, mine in enumerate(rivals):
-        for place, kind in enumerate(SHARES):
+        for place, kind in enumerate(KINDS):
             if kind in mine:
                 log_odds[k, place] = mine[kind].log_odds
             elif kind is not Kind.ROUNDED and (own[k], kind) != (Kind.ROUNDED, Kind.EVEN):

@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 
 from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.physics.greens import GreensFunction, PackedGreensFunction
-from tactomo_models.physics.mesh import SheetMesh, assembled, hat_gradients
+from tactomo_models.physics.mesh import SheetMesh, assembled, hat_gradients, stiffnesses
 from tactomo_models.sensor.description import SensorDescription
 
 NEAREST = 24  # triangles by their middles, among which a place's own is: refined ones are smaller
@@ -180,8 +180,7 @@ def assemble_sheet(
     """
     mesh, terms = sheet.mesh, electrode_terms(description, sheet, impedance)
     gradient, area = hat_gradients(mesh.p[:, mesh.t], sheet.stretch)
-    products = np.einsum("dit,djt->tij", gradient, gradient)
-    stiffness = (conductivity * area)[:, None, None] * products
+    stiffness = stiffnesses(gradient, conductivity * area)
     return terms + assembled(stiffness, mesh.t.T, terms.shape[0]).tocsc()
 
 

@@ -32,7 +32,7 @@ from scipy.spatial import Delaunay
 from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.physics.bare_sheet import BareSheet, scan_voltages, volts_per_unit
 from tactomo_models.physics.compiled_sheet import CompiledSheet, Solution, positions
-from tactomo_models.physics.mesh import assembled, hat_gradients
+from tactomo_models.physics.mesh import assembled, hat_gradients, stiffnesses
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.sheet import Ring
 
@@ -121,9 +121,7 @@ class ForwardModel(CompiledSheet):
         self._corner_support = positions(bare.support, nodes)[corners].T  # (t, 3)
         self._corner_pressable = positions(bare.pressable, nodes)[corners].T  # -1 elsewhere
         self._gradient = np.ascontiguousarray(gradient.transpose(2, 0, 1))  # (t, 2, 3)
-        self._stiffness = self._area[:, None, None] * np.einsum(
-            "tdi,tdj->tij", self._gradient, self._gradient
-        )
+        self._stiffness = stiffnesses(gradient, self._area)
         uneven = np.ones(nodes) if bare.conductivity is None else bare.conductivity
         self.at_rest = uneven[bare.pressable]
         # Conductivity of a triangle is the mean of its corners'.

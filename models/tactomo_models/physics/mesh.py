@@ -324,6 +324,14 @@ def hat_gradients(
     return on_surface, area * np.linalg.det(stretch)
 
 
+def stiffnesses(
+    gradient: FloatArray,  # (2, 3, T) of the hat functions, see `hat_gradients`
+    weight: FloatArray,  # (T,) area of each triangle times its conductivity
+) -> FloatArray:
+    """Stiffness matrices (T, 3, 3) of triangles."""
+    return np.asarray(weight[:, None, None] * np.einsum("dit,djt->tij", gradient, gradient))
+
+
 def assembled(stiffness: FloatArray, corners: IntArray, nodes: int) -> sp.csr_matrix:
     """Sum the (t, 3, 3) of triangles into one matrix on all nodes."""
     rows, columns = np.repeat(corners, 3, axis=1), np.tile(corners, (1, 3))

@@ -225,7 +225,7 @@ class FieldFit:
     def _pressed(self, name: Channel, drawing: Drawing, log_ratio: float) -> Pressed:
         """What presses on a sheet, as the sheet sees it."""
         response = self.responses[name]
-        share, pressure = map(_for_c, _felt_by(name, _drawn(drawing)))
+        share, pressure = map(_for_c, _seen_by(name, _drawn(drawing)))
         exponent = response.exponent(log_ratio)
         return Pressed(drawing.nodes, share, pressure, log_ratio, response.compiled, exponent)
 
@@ -288,7 +288,7 @@ class FieldFit:
         slopes = drawing.slopes()
         sheets = []
         for name, changes in measured.items():
-            by_share, by_pressure = _felt_by(name, slopes)
+            by_share, by_pressure = _seen_by(name, slopes)
             by_parameter = self.sheet(name).slopes(
                 fitted.solutions[name],
                 self._pressed(name, drawing, fitted.log_ratio),
@@ -351,7 +351,7 @@ class FieldFit:
             for other, at, by, end, count in zip(
                 others, rows[1:], of_each, ends, counts, strict=True
             ):
-                by_share, by_pressure = _felt_by(name, other.slopes())
+                by_share, by_pressure = _seen_by(name, other.slopes())
                 into = by[0][:, None] * by_share + by[1][:, None] * by_pressure
                 columns[at, end - count + 1 : end - 1] = into
             moved = columns.any(axis=1)
@@ -379,7 +379,7 @@ class FieldFit:
 
         Of all drawings' nodes, one drawing after the other.
         """
-        of_each = (_felt_by(name, _drawn(drawing)) for drawing in drawings)
+        of_each = (_seen_by(name, _drawn(drawing)) for drawing in drawings)
         share, pressure = (np.concatenate(each) for each in zip(*of_each, strict=True))
         response = self.responses[name].compiled
         found, slopes = response.conductivity(share, pressure, log_ratio)
@@ -476,7 +476,7 @@ def _drawn(drawing: Drawing) -> Slopes:
     return drawing.enclosed, drawing.enclosed_kpa, drawing.share, drawing.pressure_kpa
 
 
-def _felt_by(name: Channel, four: Slopes) -> tuple[FloatArray, FloatArray]:
+def _seen_by(name: Channel, four: Slopes) -> tuple[FloatArray, FloatArray]:
     """Share and pressure as a sheet sees them, or their slopes."""
     return four[:2] if name == Channel.STRUCTURE else four[2:]
 

@@ -10,7 +10,6 @@ import typer
 
 from tactomo.cli import options
 from tactomo.cli.children import print_ready, stop_asked
-from tactomo.cli.options import KeysFolder, examples
 from tactomo.cli.output import say
 from tactomo.cli.sensors import find_sensor, twin_of
 from tactomo.errors import TactomoError, needs, os_errors_as
@@ -148,7 +147,7 @@ LogFormat = Literal["auto", "text", "json", "journal"]
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo zenoh --from ipc:///run/tactomo/left/stream --robot arm",
         "tactomo zenoh --from ... --robot arm --config /etc/tactomo/zenoh.json5",
         "tactomo zenoh --bind tcp://127.0.0.1:5570 --robot arm --config desk.json5",
@@ -176,7 +175,7 @@ def zenoh(
             "[tcp/127.0.0.1:7447: --from listens there, --bind connects to it]"
         ),
     ] = None,
-    keys: KeysFolder = None,
+    keys: options.KeysFolder = None,
     log_level: Annotated[
         LogLevel, typer.Option(help="Lowest severity of logged messages.")
     ] = "info",
