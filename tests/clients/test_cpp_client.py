@@ -21,10 +21,9 @@ from typing import Any
 import msgpack  # type: ignore[import-untyped]
 import numpy as np
 import pytest
+from builds import SANITIZED, runs
 from cpp_client import (
-    SANITIZED,
     Watch,
-    can_sanitize,
     compile_probe,
     decode,
     need_headers,
@@ -53,20 +52,19 @@ ANYWHERE = "tcp://127.0.0.1:0"
 
 
 @pytest.fixture(scope="session")
-def probe(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def probe() -> Path:
     """The probe as it is."""
     need_headers()
-    return compile_probe(tmp_path_factory.mktemp("plain"), "c++", "-O1")
+    return compile_probe("c++", "-O1")
 
 
 @pytest.fixture(scope="session")
-def checked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def checked() -> Path:
     """The probe with sanitizers, where there are some."""
     need_headers()
-    folder = tmp_path_factory.mktemp("checked")
     clang = "clang++" if shutil.which("clang++") else "c++"
-    flags = SANITIZED if can_sanitize(folder, clang) else "-O1"
-    return compile_probe(folder, clang, f"{flags} -DMSGPACK_NO_BOOST")
+    flags = SANITIZED if runs(clang, SANITIZED) else "-O1"
+    return compile_probe(clang, f"{flags} -DMSGPACK_NO_BOOST")
 
 
 @pytest.fixture(scope="module")

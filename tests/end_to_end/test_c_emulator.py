@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from c_firmware import C_FOLDER, SANITIZED, build, runs
+from builds import runs
+from c_firmware import C_FOLDER, CHECKED, build
 from daemon_process import DaemonProcess
 from ears import Ears, Heard
 from needs import need
@@ -72,12 +73,10 @@ class Emulator:
 
 
 @pytest.fixture(scope="module")
-def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def program() -> Path:
     """The emulator, with sanitizers where the compiler has them."""
-    folder = tmp_path_factory.mktemp("emulator")
     need("cc")
-    flags = SANITIZED if runs(folder, "cc", SANITIZED) else "-O2"
-    return build("tactomo_emulator", folder, CFLAGS=flags)
+    return build("tactomo_emulator", CFLAGS=CHECKED if runs("cc", CHECKED) else "-O2")
 
 
 @pytest.fixture(scope="module")

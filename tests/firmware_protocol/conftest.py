@@ -5,27 +5,26 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from c_firmware import SANITIZED, Speaker, build, runs, speaking
+from builds import runs
+from c_firmware import CHECKED, Speaker, build, speaking
 from needs import lacking, need
 
 
 @pytest.fixture(scope="session")
-def sanitized(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Speaker]:
+def sanitized() -> Iterator[Speaker]:
     """The library under address and undefined behaviour sanitizers."""
-    folder = tmp_path_factory.mktemp("sanitized")
     need("cc")
-    if not runs(folder, "cc", SANITIZED):
+    if not runs("cc", CHECKED):
         lacking("needs a compiler with sanitizers")
-    with speaking(build("speak", folder, CFLAGS=SANITIZED)) as speaker:
+    with speaking(build("speak", CFLAGS=CHECKED)) as speaker:
         yield speaker
 
 
 @pytest.fixture(scope="session")
-def big_endian(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Speaker]:
+def big_endian() -> Iterator[Speaker]:
     """The library on a 32-bit machine whose high bytes come first, emulated."""
     need("qemu-ppc", "powerpc-linux-gnu-gcc")
-    folder = tmp_path_factory.mktemp("big_endian")
-    program = build("speak", folder, "powerpc-linux-gnu-gcc", LDFLAGS="-static")
+    program = build("speak", "powerpc-linux-gnu-gcc", LDFLAGS="-static")
     with speaking(program, ["qemu-ppc"]) as speaker:
         yield speaker
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from any_packets import PACKETS, SMALL_PACKETS
+from builds import runs
 from c_firmware import C_FOLDER, Speaker, answered, build, f64_bits
 from cobs import cobs
 from hypothesis import HealthCheck, given, settings
@@ -206,7 +207,7 @@ def test_the_library_compiles_without_a_warning(tmp_path: Path, compiler: str) -
         if header.returncode != 0:
             pytest.skip("needs the newlib of arm-none-eabi-gcc")
     need(compiler)
-    build("example_firmware.o", tmp_path, compiler)
+    build("example_firmware.o", compiler)
     for source in ("tactomo_protocol.c", "tactomo_device.c"):
         options = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", "-Os"]
         done = subprocess.run(
@@ -222,11 +223,10 @@ def test_the_library_compiles_without_a_warning(tmp_path: Path, compiler: str) -
 def test_a_fuzzer_finds_nothing_in_a_moment(tmp_path: Path, fuzzer: str) -> None:
     """Always the same inputs; `make fuzz` goes on for as long as one likes."""
     need("clang")
-    (tmp_path / "try.c").write_text("int LLVMFuzzerTestOneInput(void) { return 0; }\n")
-    tried = ["clang", "-fsanitize=fuzzer,address", "-o", f"{tmp_path}/try", f"{tmp_path}/try.c"]
-    if subprocess.run(tried, capture_output=True).returncode != 0:
+    empty = "int LLVMFuzzerTestOneInput(void) { return 0; }\n"
+    if not runs("clang", "-fsanitize=fuzzer,address", empty):
         lacking("needs a clang with libFuzzer (Debian: libclang-rt-14-dev)")
-    program = build(fuzzer, tmp_path)
+    program = build(fuzzer)
     seeds = tmp_path / "seeds"
     subprocess.run(
         [sys.executable, C_FOLDER / "tests" / "make_seeds.py", seeds],

@@ -10,7 +10,6 @@ import struct
 import subprocess
 import time
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -398,8 +397,8 @@ def test_a_follower_counts_pulses_and_leaves_rate_and_zero_to_the_leader(
 # --- the example ----------------------------------------------------------------------------------
 
 
-def test_the_example_firmware_runs_and_keeps_the_order_of_samples(tmp_path: Path) -> None:
-    program = build("example_on_pipes", tmp_path)
+def test_the_example_firmware_runs_and_keeps_the_order_of_samples() -> None:
+    program = build("example_on_pipes")
     packets: list[Packet] = []
     decoder = Decoder()
     with subprocess.Popen([program], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:

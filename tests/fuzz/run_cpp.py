@@ -13,7 +13,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
-from cpp_client import CPP_FOLDER, SANITIZED, STRICT
+from builds import SANITIZED
+from cpp_client import CPP_FOLDER, STRICT
 from fuzz_targets import TARGETS
 
 FUZZER = CPP_FOLDER / "tests" / "fuzz_message.cpp"

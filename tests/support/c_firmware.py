@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
+from builds import BUILD_S, SANITIZED, build_folder
 from needs import need
 from tactomo_protocol import (
     Acknowledge,
@@ -26,27 +27,20 @@ from tactomo_protocol import (
 )
 
 C_FOLDER: Final = Path(__file__).parents[2] / "firmware_protocol" / "c"
-BUILD_S: Final = 120.0
-SANITIZED: Final = "-O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all"
+CHECKED: Final = f"-O1 {SANITIZED}"
 
 
-def build(target: str, folder: Path, compiler: str = "cc", **variables: str) -> Path:
-    """Build a target of the C folder's Makefile in `folder`; skip without a compiler or make."""
+def build(target: str, compiler: str = "cc", **variables: str) -> Path:
+    """Build a target of the C folder's Makefile once a run; skip without a compiler or make."""
     need("make", compiler)
-    settings = {"BUILD": str(folder), "CC": compiler, **variables}
-    command = ["make", "-s", "-C", str(C_FOLDER), *(f"{k}={v}" for k, v in settings.items())]
-    done = subprocess.run(
-        [*command, f"{folder}/{target}"], capture_output=True, text=True, timeout=BUILD_S
-    )
+    settings = [f"CC={compiler}", *(f"{name}={value}" for name, value in variables.items())]
+    with build_folder(*settings) as folder:
+        command = ["make", "-s", "-C", str(C_FOLDER), f"BUILD={folder}", *settings]
+        done = subprocess.run(
+            [*command, f"{folder}/{target}"], capture_output=True, text=True, timeout=BUILD_S
+        )
     assert done.returncode == 0, done.stderr
     return folder / target
-
-
-def runs(folder: Path, compiler: str, flags: str) -> bool:
-    """Whether the compiler can build and run a program with these flags."""
-    (folder / "try.c").write_text("int main(void) { return 0; }\n")
-    command = [compiler, *flags.split(), "-o", str(folder / "try"), str(folder / "try.c")]
-    return subprocess.run(command, capture_output=True, timeout=BUILD_S).returncode == 0
 
 
 def f64_bits(value: float) -> str:

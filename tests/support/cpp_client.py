@@ -12,14 +12,13 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final
 
+from builds import BUILD_S, build_folder
 from needs import lacking, need
 
 CPP_FOLDER: Final = Path(__file__).parents[2] / "clients" / "cpp"
 PROBE: Final = CPP_FOLDER / "tests" / "probe.cpp"
 STRICT: Final = "-std=c++17 -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Werror"
-SANITIZED: Final = "-g -fsanitize=address,undefined -fno-sanitize-recover=all"
 PACKAGES: Final = "apt install g++ cmake pkg-config cppzmq-dev libmsgpack-dev"
-BUILD_S: Final = 300.0
 PATIENCE_S: Final = 60.0
 
 
@@ -33,28 +32,17 @@ def need_headers() -> None:
             lacking(f"needs {header}: {PACKAGES}")
 
 
-def compile_probe(folder: Path, compiler: str, flags: str) -> Path:
-    """Build clients/cpp/tests/probe.cpp, without a warning."""
-    program = folder / f"probe-{compiler}"
-    command = [compiler, *STRICT.split(), *flags.split(), f"-I{CPP_FOLDER / 'include'}"]
-    done = subprocess.run(
-        [*command, str(PROBE), "-o", str(program), "-lzmq"],
-        capture_output=True,
-        text=True,
-        timeout=BUILD_S,
-    )
-    assert done.returncode == 0, done.stderr
+def compile_probe(compiler: str, flags: str) -> Path:
+    """Build clients/cpp/tests/probe.cpp once a run, without a warning."""
+    with build_folder(compiler, flags) as folder:
+        program, built = folder / "probe", folder / "building"
+        if not program.exists():
+            command = [compiler, *STRICT.split(), *flags.split(), f"-I{CPP_FOLDER / 'include'}"]
+            command += [str(PROBE), "-o", str(built), "-lzmq"]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=BUILD_S)
+            assert done.returncode == 0, done.stderr
+            built.rename(program)
     return program
-
-
-def can_sanitize(folder: Path, compiler: str) -> bool:
-    """Whether the compiler can build and run a program with sanitizers."""
-    source, program = folder / "try.cpp", folder / "try"
-    source.write_text("int main() { return 0; }\n")
-    command = [compiler, *SANITIZED.split(), str(source), "-o", str(program)]
-    if subprocess.run(command, capture_output=True, timeout=BUILD_S).returncode:
-        return False
-    return subprocess.run([program], capture_output=True).returncode == 0
 
 
 def run(*command: object) -> str:

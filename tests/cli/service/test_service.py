@@ -19,7 +19,7 @@ from tactomo.errors import ServiceError
 from tactomo.service import installation
 from tactomo.service.installation import udev_rules
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 DEPLOY = ROOT / "deploy"
 EXAMPLES = sorted((DEPLOY / "examples").glob("*.toml"))
 PROGRAM = "/usr/bin/tactomo"
