@@ -32,11 +32,8 @@ START_S = 180.0
 class Child:
     """One running `tactomo` command."""
 
-    def __init__(
-        self, name: str, arguments: list[str], ended: queue.SimpleQueue[Child], verbose: bool
-    ) -> None:
+    def __init__(self, name: str, arguments: list[str], ended: queue.SimpleQueue[Child]) -> None:
         self.name = name
-        self._verbose = verbose
         self._lines: collections.deque[str] = collections.deque(maxlen=KEPT_LINES)
         self._ready: Mapping[str, Any] | None = None
         self._changed = threading.Event()
@@ -118,7 +115,7 @@ class Child:
         for line in self._process.stdout:
             ready = _announcement(line)
             if ready is None:
-                self._keep_line(_readable(line))
+                self._lines.append(_readable(line))
             else:
                 self._ready = ready
                 self._changed.set()
@@ -126,23 +123,17 @@ class Child:
         self._changed.set()
         self._ended.put(self)
 
-    def _keep_line(self, line: str) -> None:
-        self._lines.append(line)
-        if self._verbose:
-            print(f"{self.name}: {line}", file=sys.stderr, flush=True)
-
 
 class Family:
     """Children that are stopped together when the block ends, however it ends."""
 
-    def __init__(self, verbose: bool = False) -> None:
-        self._verbose = verbose
+    def __init__(self) -> None:
         self._children: list[Child] = []
         self._ended: queue.SimpleQueue[Child] = queue.SimpleQueue()
 
     def start(self, name: str, *arguments: str) -> Child:
         """Start one child."""
-        self._children.append(Child(name, list(arguments), self._ended, self._verbose))
+        self._children.append(Child(name, list(arguments), self._ended))
         return self._children[-1]
 
     def wait_for_an_end(self) -> Child:
@@ -174,10 +165,10 @@ def no_interruption() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def new_family(verbose: bool = False) -> Family:
+def new_family() -> Family:
     """Return a new family, which any signal to end ends as Ctrl-C does."""
     interrupt_at_end()
-    return Family(verbose)
+    return Family()
 
 
 def interrupt_at_end() -> None:

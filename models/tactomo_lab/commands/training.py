@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import typer
-from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, JsonOutput, examples, typer_app
-from tactomo.cli.output import print_json, say
+from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, examples, typer_app
+from tactomo.cli.output import say
 from tactomo.errors import needs
 
 if TYPE_CHECKING:
@@ -43,7 +43,6 @@ def simulate(
         typer.Option(min=1, max=1024, help="Processes. [one for each core]", show_default=False),
     ] = None,
     sensor: Description = DEFAULT_DESCRIPTION,
-    as_json: JsonOutput = False,
 ) -> None:
     """Simulate scenes to train networks on: voltages of both channels, and the truth.
 
@@ -66,11 +65,7 @@ def simulate(
         task = bar.add_task("scenes", total=scenes)
         for more in steps:
             bar.advance(task, more)
-    if as_json:
-        told = {"folder": str(folder), "seed": seed, "sensor": description.name}
-        print_json({**told, "scenes": scenes})
-    else:
-        say(f"{folder}: {scenes} scenes")
+    say(f"{folder}: {scenes} scenes")
 
 
 @app.command(
@@ -108,7 +103,6 @@ def train(
         Path | None, typer.Option(help="Network to continue from. [FOLDER/CONFIGURATION.pt]")
     ] = None,
     sensor: Description = DEFAULT_DESCRIPTION,
-    as_json: JsonOutput = False,
 ) -> None:
     """Train a network on simulated scenes and export it to ONNX.
 
@@ -154,17 +148,7 @@ def train(
         training = _train(prepared, settings, kept, configuration)
         written = output or own_path(description, KIND)
         export_trained(prepared, training, written)
-    if as_json:
-        told = {
-            "configuration": configuration,
-            "folder": str(folder),
-            "simulated": True,
-            "output": str(written),
-        }
-        history = [asdict(epoch) for epoch in training.history]
-        print_json({**told, **asdict(settings), "history": history})
-    else:
-        say(f"wrote {written}: {written.stat().st_size / 1e6:.1f} MB")
+    say(f"wrote {written}: {written.stat().st_size / 1e6:.1f} MB")
 
 
 def _train(

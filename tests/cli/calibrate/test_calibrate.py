@@ -295,8 +295,3 @@ def test_a_session_keeps_what_was_taken_and_goes_on(pressed: Pressed) -> None:
     np.testing.assert_allclose(taken, ROWS, rtol=1e-6)
     assert [r.direction for r in kept.readings] == ["up"] * 5 + ["down"] * 3
     assert kept.subject.device_ids == ("skin-7f3a",)
-    with Terminal(*command, "--fresh") as terminal:
-        terminal.wait_for("Reading 1, going")
-        terminal.enter("done")
-        assert terminal.wait() == 1
-    assert log.with_suffix(".csv.old").exists()

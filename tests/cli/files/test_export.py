@@ -117,7 +117,7 @@ def test_a_daemon_that_was_restarted_begins_anew(tactomo: Run, tmp_path: Path) -
     tactomo("export", "two.mcap", "two.csv", status=0)
     times = sorted({float(row["time_s"]) for row in rows_of(tmp_path / "two.csv")})
     np.testing.assert_allclose(times, np.arange(FRAMES) * PERIOD_NS * 1e-9)
-    result = tactomo("plot", "two.mcap", "-o", "two.svg", "--what", "path")
+    result = tactomo("plot", "two.mcap", "-o", "two.svg")
     assert "wrote two.svg: 4 contacts" in result.stdout  # 1 and 2, then 1' and 2'
 
 
@@ -222,7 +222,7 @@ def test_what_holds_no_frames_is_reconstructed_first(tactomo: Run, tmp_path: Pat
         assert "age_s" not in keys  # nobody knows it here, either
         stamp = each.decoded_message.header.stamp
         assert each.message.log_time == stamp.sec * 1_000_000_000 + stamp.nanosec
-    tactomo("plot", "bare.mcap", "-o", "made.png", "--what", "path", status=0)
+    tactomo("plot", "bare.mcap", "-o", "made.png", status=0)
     assert not list(tmp_path.glob(".tactomo*"))
 
 

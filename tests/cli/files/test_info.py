@@ -68,10 +68,3 @@ def test_names_of_others_are_shown_as_they_are(tactomo: Run, tmp_path: Path) -> 
     for name in (BAD_DEVICE, BAD_SENSOR, "skin[left]"):
         assert name in result.stdout
     assert "\x1b]" not in result.stdout
-
-
-def test_models_are_not_built_over_a_file(tactomo: Run, tmp_path: Path) -> None:
-    (tmp_path / "thesis.npz").write_text("precious")
-    result = tactomo("models", "build", "-o", "thesis.npz", status=1)
-    assert "thesis.npz exists already" in result.stderr
-    assert (tmp_path / "thesis.npz").read_text() == "precious"

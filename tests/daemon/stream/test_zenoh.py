@@ -33,7 +33,7 @@ from tactomo_client.messages import decode_message, topic
 from waiting import PATIENCE_S, repeated, wait_until
 from whole_system import SENSOR, running_demo
 
-ZENOH = ("-m", "tactomo.cli", "zenoh", "--log-format", "json")
+ZENOH = ("-m", "tactomo.cli", "zenoh")
 EXAMPLES = Path(__file__).parents[3] / "deploy/examples"
 Configure = Callable[..., Path]
 TOUCH = [Contact(1, 10.0, 0.0, 700.0, 0.1, 0.01, 170.0)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -217,12 +217,8 @@ class TestCommand:
     ) -> None:
         command = ("models", "train", robust, "--configuration", "ours-small", "-d", square_file)
         files = ("--output", "ours.onnx", "--checkpoint", "ours.pt")
-        result = tactomo(*command, *files, "--epochs", 1, "--jobs", 1, "--json", status=0)
-        told = json.loads(result.stdout)
-        assert (told["simulated"], told["configuration"], told["epochs"]) == (True, "ours-small", 1)
-        (epoch,) = told["history"]
-        assert epoch["loss"] > 0
-        assert "epoch 1: loss" in result.stderr
+        result = tactomo(*command, *files, "--epochs", 1, "--jobs", 1, status=0)
+        assert re.search(r"epoch 1: loss \d+\.\d*[1-9]", result.stderr)
         Network(tmp_path / "ours.onnx", load_description(square_file), "network")
         again = tactomo(*command, *files, "--epochs", 1, status=0)
         assert "going on after epoch 1" in again.stderr

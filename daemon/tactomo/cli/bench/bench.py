@@ -69,7 +69,7 @@ app = options.typer_app()
 @app.command(
     epilog=options.examples(
         "tactomo bench",
-        "tactomo bench --seconds 20 --ports 1",
+        "tactomo bench --seconds 20",
         "tactomo bench --json > times.json",
         "tactomo bench --chart speed_accuracy.png --count 25",
         "tactomo bench --chart mine.png --method my_module:MyMethod --method auto",
@@ -86,10 +86,6 @@ def bench(
             help="Seconds of each of the four live scenes.",
         ),
     ] = STATUS_S,
-    ports: Annotated[
-        int | None,
-        typer.Option(min=1, max=2, rich_help_panel=LIVE, help="Lines of the twin. [one a channel]"),
-    ] = None,
     rate: Annotated[
         float, typer.Option(rich_help_panel=LIVE, help="Dual scans a second of the twin.")
     ] = 20.0,
@@ -132,7 +128,7 @@ def bench(
         from tactomo.cli.console import Console
 
         with Console(stderr=True).status("starting") as line:
-            _measure_twin(results, ports, rate, seconds, line.update)
+            _measure_twin(results, rate, seconds, line.update)
     if as_json:
         print_json(asdict(results))
     elif chart is None:
@@ -140,7 +136,7 @@ def bench(
 
 
 def _measure_twin(
-    results: Results, ports: int | None, rate: float, seconds: float, report: Callable[[str], None]
+    results: Results, rate: float, seconds: float, report: Callable[[str], None]
 ) -> None:
     from tactomo_client import request, subscribe
     from tactomo_models import load_description
@@ -159,7 +155,6 @@ def _measure_twin(
         skin = family.start(
             *("twin", "twin", *described, "--rate", str(rate)),
             *("--twin-control", at("twin"), "--announce"),
-            *([] if ports is None else ["--ports", str(ports)]),
         ).wait_ready()
         lines = [word for path in skin["ports"] for word in ("--port", path)]
         family.start(

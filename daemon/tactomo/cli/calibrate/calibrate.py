@@ -72,9 +72,6 @@ def live(
     sensor: options.Sensor = None,
     diameter_mm: DiameterMm = None,
     area_mm2: AreaMm2 = None,
-    fresh: Annotated[
-        bool, typer.Option("--fresh", help="Begin anew, without earlier readings.")
-    ] = False,
     output: options.KeptFile = None,
     address: options.Address = None,
     keys: options.KeysFolder = None,
@@ -83,7 +80,7 @@ def live(
 
     The command says what to press, waits until the contact is still, asks for the load cell's
     reading, and says when there are enough readings. Ctrl-C keeps the readings; the same command
-    continues later.
+    continues later, until you delete the file of readings that it names.
     """
     from tactomo_client.control import to_status
     from tactomo_models.calibration.calibration_file import CALIBRATIONS
@@ -94,7 +91,7 @@ def live(
     status = to_status(newest_status(found.sensor, address, keys))
     path = output or CALIBRATIONS.path(found.sensor)
     area = _area_mm2(diameter_mm, area_mm2)
-    made = guided(status, found.stream, keys, area, path, fresh=fresh)
+    made = guided(status, found.stream, keys, area, path)
     print_calibration(made)
     keep(CALIBRATIONS, made, path, address, keys)
 

@@ -69,8 +69,6 @@ def guided(
     keys: Path | None,
     area_mm2: float | None,
     path: Path,
-    *,
-    fresh: bool,
 ) -> PressureCalibration:
     """Take readings together with the user, and fit them; `status` is the daemon's.
 
@@ -85,7 +83,7 @@ def guided(
     subject = _subject(status)
     view = View(status.sensor, stream, keys)
     try:
-        session = _Session(view, console, status, area_mm2, log, fresh=fresh)
+        session = _Session(view, console, status, area_mm2, log)
         session.run()
     finally:
         view.close()
@@ -140,14 +138,10 @@ class _Session:
         status: Status,
         area_mm2: float | None,
         log: Path,
-        *,
-        fresh: bool,
     ) -> None:
         self._view, self._console, self._log = view, console, log
         self._area_mm2 = area_mm2
         self._suggested = suggestions_kpa(status)
-        if fresh and log.exists():
-            log.replace(log.with_suffix(".csv.old"))
         self.readings: list[Reading] = _read_log(log)
 
     def run(self) -> None:
@@ -173,7 +167,8 @@ class _Session:
             diameter_mm = self._asked("Diameter of the indenter in mm: ", least=1.0, most=1e3)
             self._area_mm2 = math.pi / 4 * diameter_mm**2
         if self.readings:
-            say(f"Going on with {len(self.readings)} readings in {self._log}; --fresh begins anew.")
+            kept = f"{len(self.readings)} readings in {self._log}"
+            say(f"Going on with {kept}; delete the file to begin anew.")
             self._print_progress()
 
     def _take_one(self) -> bool:

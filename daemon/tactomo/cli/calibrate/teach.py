@@ -43,16 +43,10 @@ KeepOdd = Annotated[
 
 
 @app.command(
-    epilog=options.examples(
-        "tactomo teach live", "tactomo teach live --sensor left_forearm --presses palm.npz"
-    )
+    epilog=options.examples("tactomo teach live", "tactomo teach live --sensor left_forearm")
 )
 def live(
     sensor: options.Sensor = None,
-    presses: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.npz", help="File for the presses. [beside the taught model]"),
-    ] = None,
     description: options.GivenDescription = None,
     output: options.KeptFile = None,
     keep_odd: KeepOdd = False,
@@ -62,7 +56,8 @@ def live(
     """Teach press by press with the running daemon, which guides you.
 
     The command says where to press, listens for a second while you hold the press, and learns at
-    the end. Each press is stored at once; the same command continues later.
+    the end. Each press is stored at once, in a file beside the taught model; the same command
+    continues later.
     """
     from tactomo_models.calibration.taught_skin import TAUGHT
 
@@ -70,7 +65,7 @@ def live(
 
     found = find_sensor(sensor, address, keys)
     path = output or TAUGHT.path(found.sensor)
-    file = presses or path.with_name(f"{found.sensor}.presses.npz")
+    file = path.with_name(f"{found.sensor}.presses.npz")
     sensor_description, subject = guided(found.sensor, found.stream, keys, description, file)
     _teach(file, sensor_description, subject, path, address, keys, keep_odd=keep_odd)
 

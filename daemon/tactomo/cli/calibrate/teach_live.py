@@ -170,7 +170,7 @@ class _Session:
                 rows = row if rows is None else np.concatenate([rows, row])
             if rows is not None:
                 self._arrays[name] = rows
-        step = "give --presses a file to write"
+        step = "give --output in a folder that you may write"
         with os_errors_as(TactomoError, f"cannot write {self._file}", step):
             write_arrays(self._file, self._arrays)
 

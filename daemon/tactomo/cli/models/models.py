@@ -29,20 +29,14 @@ app = typer_app(
     epilog=examples(
         "tactomo models build",
         "tactomo models build --description my_skin.toml",
-        "tactomo models build --description my_skin.toml --output my_skin.npz",
     )
 )
-def build(
-    description: Description = DEFAULT_DESCRIPTION,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="[the cache, where the daemon looks]")
-    ] = None,
-) -> None:
+def build(description: Description = DEFAULT_DESCRIPTION) -> None:
     """Build the models of a sensor description: forward model, Jacobian, Tikhonov matrix.
 
     The daemon builds missing models at its start; this command saves the daemon the time. A hash
-    binds the models to the description: after a change of geometry, build again. A file is
-    overwritten only if it already holds these models.
+    binds the models to the description: after a change of geometry, build again. The models lie in
+    the cache, where the daemon looks.
     """
     from tactomo_models import ArtifactError, load_description
     from tactomo_models.physics.artifact import (
@@ -53,17 +47,15 @@ def build(
     )
 
     from tactomo.cli.console import Console
-    from tactomo.cli.plot.plot import prepare_file
 
     sensor = load_description(description)
-    path = output or default_path(sensor)
+    path = default_path(sensor)
     try:
         load_artifact(path, sensor)
         say(f"{path} is up to date")
         return
-    except ArtifactError:  # missing, damaged, or of another sensor or version: build it
-        if output is not None:
-            prepare_file(output, force=False)
+    except ArtifactError:  # missing, damaged, or of another version: build it
+        pass
     with Console(stderr=True).status(sensor.name) as line:
         artifact = build_artifact(sensor, lambda step: line.update(f"{sensor.name}: {step}"))
         save_artifact(artifact, path)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 WIDTH_IN: Final = 12.0
 STRIP_IN: Final = 2.75
+PATH_IN: Final = 6.4
 HEIGHTS_IN: Final = {"pressure": 2.0, "force": 1.5, "misfit": 1.2, "flags": 1.1, "timing": 1.3}
 SIGMAS: Final = 2.0
 GAP_S: Final = 0.5  # without a frame for so long, a line is broken
@@ -37,37 +38,25 @@ def draw_page(
     course: Course,
     maps: Sequence[Moment],
     description: SensorDescription | None,
-    panels: Sequence[str],
     title: str,
 ) -> Figure:
-    """Return the page with the panels that are requested and have data."""
-    rows = [panel for panel in panels if panel in HEIGHTS_IN and _has_data(panel, course)]
-    has_path = "path" in panels and bool(course.tracks)
-    strip_in = STRIP_IN if maps else 0.0
-    body_in = max(sum(HEIGHTS_IN[row] for row in rows), 6.4 if has_path else 0.0)
-    figure = Figure(figsize=(WIDTH_IN, strip_in + body_in + 0.7), layout="constrained")
+    """Return the page with the panels that have data."""
+    rows = [panel for panel in HEIGHTS_IN if _has_data(panel, course)]
+    body_in = max(sum(HEIGHTS_IN[row] for row in rows), PATH_IN if course.tracks else 0.0)
+    figure = Figure(figsize=(WIDTH_IN, STRIP_IN + body_in + 0.7), layout="constrained")
     named = f"{plain(title)}\n"
     figure.suptitle(named, fontsize=14, x=0.01, ha="left", fontweight="bold", parse_math=False)
     figure.text(0.01, 1 - 0.42 / figure.get_figheight(), _subtitle(course), color="0.4")
-    parts = [part for part, height in (("strip", strip_in), ("body", body_in)) if height]
-    heights = [height for height in (strip_in, body_in) if height]
-    column: Any = figure.subfigures(len(parts), 1, height_ratios=heights, squeeze=False)
-    areas = dict(zip(parts, column[:, 0], strict=True))
+    column: Any = figure.subfigures(2, 1, height_ratios=(STRIP_IN, body_in))
+    strip, body = column
     colours = _contact_colours(course)
-    if maps:
-        titles = [
-            f"{letter}   {moment.time_s:.2f} s"
-            for letter, moment in zip(LETTERS, maps, strict=False)
-        ]
-        draw_strip(areas["strip"], [moment.frame for moment in maps], description, titles)
-    if has_path and rows:
-        left, right = areas["body"].subfigures(1, 2, width_ratios=(1.0, 1.35))
+    times = zip(LETTERS, (moment.time_s for moment in maps), strict=False)
+    titles = [f"{letter}   {time_s:.2f} s" for letter, time_s in times]
+    draw_strip(strip, [moment.frame for moment in maps], description, titles)
+    if course.tracks:
+        left, body = body.subfigures(1, 2, width_ratios=(1.0, 1.35))
         _draw_path(left, course, description, colours)
-        _draw_rows(right, rows, course, maps, colours)
-    elif has_path:
-        _draw_path(areas["body"], course, description, colours)
-    elif rows:
-        _draw_rows(areas["body"], rows, course, maps, colours)
+    _draw_rows(body, rows, course, maps, colours)
     return figure
 
 

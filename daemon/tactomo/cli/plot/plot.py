@@ -25,7 +25,6 @@ from tactomo.plain import counted
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PANELS = ("maps", "path", "pressure", "force", "misfit", "flags", "timing")
 PAGE_DPI = 125
 
 app = typer_app()
@@ -34,7 +33,7 @@ app = typer_app()
 @app.command(
     epilog=examples(
         "tactomo plot grasp.mcap -o grasp.png",
-        "tactomo plot grasp.mcap -o push.pdf --from 2 --to 8 --what maps,pressure,force",
+        "tactomo plot grasp.mcap -o push.pdf --from 2 --to 8",
     )
 )
 def plot(
@@ -42,12 +41,6 @@ def plot(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="The picture: .png, .svg or .pdf.")
     ] = Path("recording.png"),
-    what: Annotated[
-        str,
-        typer.Option(
-            metavar="PANELS", help=f"Some of {', '.join(PANELS)}. [all]", show_default=False
-        ),
-    ] = ",".join(PANELS),
     start_s: FromOption = 0.0,
     end_s: ToOption = None,
     description: RecordedDescription = None,
@@ -55,17 +48,16 @@ def plot(
 ) -> None:
     """Draw a recording on one page.
 
-    *maps*: a map for each stretch with the same contacts, the longest stretches first, marked by
-    letters. *path*: the contacts' paths. *pressure*, *force*: over time, with a band of two
-    standard uncertainties (95 %) where known. *misfit*: the rms of the residual in units of the
-    noise; about 1 is good. *flags*: the method and the flags of each frame. *timing*: the age of
-    frames at publication, the time between frames, and lost frames.
+    Maps: a map for each stretch with the same contacts, the longest stretches first, marked by
+    letters. The contacts' paths. Pressure and force over time, with a band of two standard
+    uncertainties (95 %) where known. Misfit: the rms of the residual in units of the noise; about 1
+    is good. The method and the flags of each frame. Timing: the age of frames at publication, the
+    time between frames, and lost frames.
 
     Uses the recorded maps (`tactomo record --maps`). Without recorded maps, the command first
     reconstructs the recording, by the same code as live. Needs matplotlib: `pip install
     'tactomo[plot]'`.
     """
-    panels = _panels(what)
     need_recording(recording)
     prepare_picture(output, force=force)
     from tactomo.cli.plot.course import Course, read_course, read_maps
@@ -78,24 +70,14 @@ def plot(
                 f"there are no frames of {recording} between these times",
                 "`tactomo info` shows its length",
             )
-        maps = read_maps(frames, course) if "maps" in panels else []
-        figure = draw_page(course, maps, frames.description, panels, recording.name)
+        maps = read_maps(frames, course)
+        figure = draw_page(course, maps, frames.description, recording.name)
     save_figure(figure, output, PAGE_DPI)
     say(
         f"wrote {output}: {counted(len(course.tracks), 'contact')} in "
         f"{counted(len(course.times_s), 'frame')}, "
         f"{course.times_s[-1] - course.times_s[0]:.1f} s"
     )
-
-
-def _panels(what: str) -> tuple[str, ...]:
-    requested = [panel.strip() for panel in what.split(",") if panel.strip()]
-    unknown = [panel for panel in requested if panel not in PANELS]
-    if unknown or not requested:
-        raise typer.BadParameter(
-            f"--what {what}: choose from {', '.join(PANELS)}, separated by commas"
-        )
-    return tuple(panel for panel in PANELS if panel in requested)
 
 
 def prepare_picture(output: Path, *, force: bool = True) -> None:

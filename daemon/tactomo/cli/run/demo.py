@@ -49,9 +49,6 @@ def demo(
     noise_uv: Annotated[
         float | None, typer.Option(min=0.0, max=1e9, help="Converter noise, µV rms.")
     ] = None,
-    record: Annotated[
-        Path | None, typer.Option(help="Record the ports' bytes to this file.")
-    ] = None,
     viewer_port: options.ViewerPort = None,
     stream: options.ServeStream = None,
     control: options.ServeControl = None,
@@ -64,9 +61,6 @@ def demo(
     ] = None,
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Do not open the page, where there is a desktop.")
-    ] = False,
-    verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Show the logs of the three programs.")
     ] = False,
     announce: options.Announce = False,
 ) -> None:
@@ -97,12 +91,8 @@ def demo(
         *("--stream", stream, "--control", control),
         *_optional("--method", method),
         *("--set", f"recording.folder={json.dumps(str(Path.cwd()))}"),
-        *([] if record is None else ["--set", f"recording.file={json.dumps(str(record))}"]),
     ]
-    with (
-        tempfile.TemporaryDirectory(prefix="tactomo-") as folder,
-        new_family(verbose) as family,
-    ):
+    with tempfile.TemporaryDirectory(prefix="tactomo-") as folder, new_family() as family:
         # On a first start the daemon's models take as long to build as the twin's: do both at once.
         builder = family.start("models build", "models", "build", "--description", description)
         skin = family.start("twin", "twin", "--link", folder, "--announce", *twin_options)

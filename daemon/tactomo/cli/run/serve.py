@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -142,10 +142,6 @@ def viewer(
     viewer.serve(viewer_port, that_end())
 
 
-LogLevel = Literal["debug", "info", "warning", "error"]
-LogFormat = Literal["auto", "text", "json", "journal"]
-
-
 @app.command(
     epilog=options.examples(
         "tactomo zenoh --from ipc:///run/tactomo/left/stream --robot arm",
@@ -176,15 +172,6 @@ def zenoh(
         ),
     ] = None,
     keys: options.KeysFolder = None,
-    log_level: Annotated[
-        LogLevel, typer.Option(help="Lowest severity of logged messages.")
-    ] = "info",
-    log_format: Annotated[
-        LogFormat,
-        typer.Option(
-            help="text, json, journal; auto: text on a terminal, journal for journald, else json."
-        ),
-    ] = "auto",
 ) -> None:
     """Carry streams beyond this computer by Eclipse Zenoh, until stopped.
 
@@ -204,7 +191,7 @@ def zenoh(
     from tactomo.log import configure_logging
     from tactomo.stream.zenoh_bridge import serve
 
-    configure_logging(log_level, log_format)
+    configure_logging("info")
     if bind:
         serve(ZenohProxy(_checked(robot) if robot else "*", _endpoint(bind), config))
     else:
