@@ -37,10 +37,12 @@ def options_of(words: list[str]) -> tuple[str, set[str]]:
     command: Any = get_command(app)
     name = "tactomo"
     for word in words:
-        if word not in getattr(command, "commands", ()):
-            assert not hasattr(command, "commands") or not word.isalpha(), f"{name} {word}"
+        is_group = hasattr(command, "get_command")
+        below = command.get_command(None, word) if is_group else None
+        if below is None:
+            assert not is_group or not word.isalpha(), f"{name} {word}"
             break
-        command, name = command.commands[word], f"{name} {word}"
+        command, name = below, f"{name} {word}"
     return name, {
         flag for each in command.params for flag in (*each.opts, *each.secondary_opts, "--help")
     }

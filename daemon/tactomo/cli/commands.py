@@ -18,7 +18,7 @@ import copy
 import functools
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib import import_module
 from typing import Annotated, Any, Final, NamedTuple
 
@@ -97,8 +97,7 @@ def _build(name: str, app: typer.Typer) -> Any:
 
 def _refuse_nonsense(command: Any) -> None:
     """Have a command refuse what types let through: numbers without end, and paths without name."""
-    below = getattr(command, "commands", {})
-    for each in (below.built if isinstance(below, _Commands) else below).values():
+    for each in getattr(command, "commands", {}).values():
         _refuse_nonsense(each)
     for parameter in command.params:
         parameter.type = copy.copy(parameter.type)
@@ -114,36 +113,29 @@ def _checked(convert: Any, value: Any, parameter: Any, context: Any) -> Any:
     return made
 
 
-class _Commands(Mapping[str, Any]):
-    """The commands of a group by name, each built when it is looked up."""
+class Group(TyperGroup):
+    """A group to which entry points may add commands; each is imported when it is looked up."""
 
-    def __init__(
-        self,
-        group: str,  # the group's name and a dot; empty for the commands at the top
-        built: Mapping[str, Any],  # those that its Typer holds
-    ) -> None:
-        self._group = group
-        self.built = dict(built)
+    @property
+    def _prefix(self) -> str:
+        return "" if self.name == "tactomo" else f"{self.name}."
 
-    def __getitem__(self, name: str) -> Any:
-        if name not in self.built:
-            self.built[name] = _build(name, self._load(name))
-        return self.built[name]
-
-    def __iter__(self) -> Iterator[str]:
-        points = [p.removeprefix(self._group) for p in _entry_points() if self._holds(p)]
-        lines = () if self._group else COMMANDS.values()
+    def list_commands(self, ctx: typer.Context | None) -> list[str]:  # type: ignore[override]
+        """Return the names in the order of the table."""
+        begin = self._prefix
+        points = [p.removeprefix(begin) for p in _entry_points() if p.startswith(begin)]
+        points = [point for point in points if "." not in point]
+        lines = () if begin else COMMANDS.values()
         ours = [line.name for line in lines if line.module or line.name in points]
-        return iter(dict.fromkeys([*ours, *self.built, *sorted(points)]))
+        return list(dict.fromkeys([*ours, *self.commands, *sorted(points)]))
 
-    def __len__(self) -> int:
-        return len(list(iter(self)))
+    def get_command(self, ctx: typer.Context | None, cmd_name: str) -> Any:  # type: ignore[override]
+        """Return a command, or None where there is none of that name."""
+        if cmd_name not in self.commands and (app := self._load(self._prefix + cmd_name)):
+            self.commands[cmd_name] = _build(cmd_name, app)
+        return self.commands.get(cmd_name)
 
-    def _holds(self, point: str) -> bool:
-        return point.startswith(self._group) and "." not in point.removeprefix(self._group)
-
-    def _load(self, name: str) -> Any:
-        path = self._group + name
+    def _load(self, path: str) -> Any:
         line = COMMANDS.get(path)
         if line is not None and line.module:
             return import_module(line.module).app
@@ -151,20 +143,7 @@ class _Commands(Mapping[str, Any]):
             return _entry_points()[path].load()
         if line is not None or path in OF_LABORATORY:
             raise not_installed(path.replace(".", " "))
-        raise KeyError(name)
-
-
-class Group(TyperGroup):
-    """A group of commands to which entry points may add some."""
-
-    def __init__(self, **attrs: Any) -> None:
-        super().__init__(**attrs)
-        prefix = "" if self.name == "tactomo" else f"{self.name}."
-        self.commands = _Commands(prefix, self.commands)  # type: ignore[assignment]
-
-    def list_commands(self, ctx: typer.Context) -> list[str]:  # type: ignore[override]
-        """Return the names in the order of the table."""
-        return list(self.commands)
+        return None
 
 
 class _Top(Group):
@@ -191,9 +170,9 @@ class _Top(Group):
         return ctx.command.shell_complete(ctx, incomplete)
 
     def _line(self, name: str) -> Line:
-        return COMMANDS.get(name) or Line(
-            OTHERS, name, self.commands[name].get_short_help_str(), ""
-        )
+        if name in COMMANDS:
+            return COMMANDS[name]
+        return Line(OTHERS, name, self.get_command(None, name).get_short_help_str(), "")
 
 
 def _commit() -> str:

@@ -175,10 +175,6 @@ Announce: TypeAlias = Annotated[
         "--announce", help="Print one line of JSON with the addresses when ready, for programs."
     ),
 ]
-TwinPorts: TypeAlias = Annotated[
-    int | None,
-    typer.Option(min=1, max=2, help="One line for both channels, or a line for each. [each]"),
-]
 Rate: TypeAlias = Annotated[float, typer.Option(help="Dual scans a second.")]
 KeptFile: TypeAlias = Annotated[
     Path | None,

@@ -33,7 +33,6 @@ app = options.typer_app()
     epilog=options.examples(
         "tactomo demo",
         "tactomo demo --scene two_fingers_merge",
-        "tactomo demo --ports 1 --noise-uv 50",
         "tactomo demo --description graded_square",
     )
 )
@@ -41,13 +40,9 @@ def demo(
     sensor: options.NewName = options.DEFAULT_NAME,
     description: options.Description = options.DEFAULT_DESCRIPTION,
     method: options.GivenMethod = None,
-    ports: options.TwinPorts = None,
     rate: options.Rate = 20.0,
     scene: Annotated[
         Path | None, typer.Option(help="A scripted scene, shipped or TOML, that presses by itself.")
-    ] = None,
-    noise_uv: Annotated[
-        float | None, typer.Option(min=0.0, max=1e9, help="Converter noise, µV rms.")
     ] = None,
     viewer_port: options.ViewerPort = None,
     stream: options.ServeStream = None,
@@ -82,9 +77,7 @@ def demo(
     presses_itself = scene is None and not announce
     twin_options = [
         *("--description", description, "--rate", str(rate), "--twin-control", twin_control),
-        *_optional("--ports", ports),
         *_optional("--scene", scene),
-        *_optional("--noise-uv", noise_uv),
     ]
     daemon_options = [
         *("--sensor", sensor, "--description", description),
@@ -245,7 +238,10 @@ def _has_desktop() -> bool:
 )
 def twin(
     description: options.Description = options.DEFAULT_DESCRIPTION,
-    ports: options.TwinPorts = None,
+    ports: Annotated[
+        int | None,
+        typer.Option(min=1, max=2, help="One line for both channels, or a line for each. [each]"),
+    ] = None,
     rate: options.Rate = 20.0,
     protocol: options.Protocol = "tactomo",
     scene: Annotated[
