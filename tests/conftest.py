@@ -155,7 +155,7 @@ def _chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[webdriver.Ch
 
 @pytest.fixture
 def browser(_chromium: webdriver.Chrome) -> Iterator[webdriver.Chrome]:
-    """A headless Chromium, 1280 × 900, showing an empty page. Mark the test `browser`.
+    """A headless Chromium, 1280 × 900, showing an empty page. FrameRecord the test `browser`.
 
     `browser.get_log("browser")` has what pages wrote to the console since the test began.
     """

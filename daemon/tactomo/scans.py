@@ -1,4 +1,4 @@
-"""What passes from the ports to imaging, into recordings and back: scans, dual scans, marks.
+"""What passes from the ports to imaging, into recordings and back: scans, dual scans, frame records.
 
 Plain values without the serial stack, so that whatever is pure may import them.
 """
@@ -62,7 +62,7 @@ class ChannelScan:
         return ScanKey(self.channel, self.counter, self.device_us)
 
 
-class Delivery(NamedTuple):
+class PortRead(NamedTuple):
     """What one read of a port brought."""
 
     port: int
@@ -94,7 +94,7 @@ class Timing(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Mark:
+class FrameRecord:
     """One dual scan that the daemon reconstructed, and with what."""
 
     scans: tuple[ScanKey, ...]
@@ -121,7 +121,7 @@ class DualScan:
     counter: int
     magnitude: ChannelScan | None
     structure: ChannelScan | None
-    mark: Mark | None = None  # what a recording says about it, in an exact replay
+    mark: FrameRecord | None = None  # what a recording says about it, in an exact replay
 
     @property
     def scans(self) -> tuple[ChannelScan, ...]:

@@ -19,7 +19,7 @@ RING: Final = 256
 """Of each measure: at 20 Hz 13 s, long enough for a 99th percentile to hold two values."""
 RATE_WINDOW_NS: Final = 3_000_000_000  # three hellos of a device; a rate that falls shows within it
 WAITS: Final = 5  # A median of five bears two waits that were long by chance
-FEW: Final = 3.0  # as many of its own periods late, and something has stopped
+LATE_PERIODS: Final = 3.0  # as many of its own periods late, and something has stopped
 LONGEST_PERIOD_S: Final = 60.0
 MINUTE_S: Final = 60.0
 LOOK_S: Final = 1.0
@@ -72,7 +72,7 @@ class Pace:
     def add(self, wait_s: float) -> None:
         """Take note of how long one was waited for."""
         self._waits_s.append(wait_s)
-        self.few_s = FEW * min(median_low(self._waits_s), LONGEST_PERIOD_S)
+        self.few_s = LATE_PERIODS * min(median_low(self._waits_s), LONGEST_PERIOD_S)
 
     def clear(self) -> None:
         """Forget it: something else comes from now on."""

@@ -82,7 +82,7 @@ class Worker:
         """Give back sockets, ports and files, once the thread has ended."""
 
 
-class Bell:
+class Wakeup:
     """Wakes a thread that polls, with its `reader` among what it polls."""
 
     def __init__(self) -> None:
@@ -90,13 +90,13 @@ class Bell:
         self.reader.setblocking(False)
         self._writer.setblocking(False)
 
-    def ring(self) -> None:
+    def set(self) -> None:
         """Wake the thread; for any thread."""
         with contextlib.suppress(OSError):  # full of reasons to wake up already, or closed
             self._writer.send(b"\0")
 
-    def hear(self) -> None:
-        """Forget that it rang; for the thread that polls."""
+    def drain(self) -> None:
+        """Forget that it was set; for the thread that polls."""
         with contextlib.suppress(BlockingIOError):
             self.reader.recv(4096)
 

@@ -26,8 +26,8 @@ MAX_SIZE: Final = 1e30  # of any number, in any unit: what is larger overflows i
 _DOUBLE: Final = 8  # bytes; smaller numbers cannot be as large, or not once they are doubles
 _SMALL_BYTES: Final = 64 << 20
 _PACKED: Final = 16
-_MOST_ARRAYS: Final = 4096
-_MOST_LINE: Final = 1 << 20  # characters of a frame; the largest pattern has 4096 numbers
+_MAX_ARRAYS: Final = 4096
+_MAX_LINE: Final = 1 << 20  # characters of a frame; the largest pattern has 4096 numbers
 
 
 def read_matlab(path: Path) -> Arrays:
@@ -65,10 +65,10 @@ def most_unpacked(path: Path) -> int:
 def check_unpacked(path: Path, size: int, arrays: int) -> None:
     """Raise DataError where a file unpacks to what no file of measured numbers does."""
     most = most_unpacked(path)
-    if size > most or arrays > _MOST_ARRAYS:
+    if size > most or arrays > _MAX_ARRAYS:
         raise DataError(
             f"{path} claims {arrays} arrays of {size / 1e6:.0f} MB in all; of a file of its size, "
-            f"{_MOST_ARRAYS} of {most / 1e6:.0f} MB are read: save it anew, uncompressed"
+            f"{_MAX_ARRAYS} of {most / 1e6:.0f} MB are read: save it anew, uncompressed"
         )
 
 
@@ -99,7 +99,7 @@ def read_text(path: Path) -> Arrays:
     numbers, columns = array("d"), 0  # of each, the real and the imaginary part
     try:
         with open_regular(path) as binary, io.TextIOWrapper(binary, "utf-8-sig") as file:
-            for number, line in enumerate(iter(lambda: file.readline(_MOST_LINE), ""), start=1):
+            for number, line in enumerate(iter(lambda: file.readline(_MAX_LINE), ""), start=1):
                 row = _row(path, number, line, bool(columns))
                 if not row:
                     continue
@@ -120,7 +120,7 @@ def read_text(path: Path) -> Arrays:
 
 def _row(path: Path, number: int, line: str, has_begun: bool) -> list[complex]:
     """Return a line's numbers; none of a comment, an empty line or a header."""
-    if len(line) >= _MOST_LINE:
+    if len(line) >= _MAX_LINE:
         raise DataError(f"{path}, line {number}: longer than any frame; export one frame a line")
     line = re.split("[#%]", line, maxsplit=1)[0]
     if ";" in line:

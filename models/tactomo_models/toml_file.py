@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from tactomo_models.foreign_file import MAX_TEXT_BYTES, read_regular
 
-MOST_DOTS: Final = 500  # in a line: what a key of many parts costs to read grows by its square
+MAX_DOTS: Final = 500  # in a line: what a key of many parts costs to read grows by its square
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -24,8 +24,8 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 def parse_toml(text: str) -> dict[str, Any]:
     """Return what a text of TOML says; raise ValueError where it is none."""
-    if max(line.count(".") for line in text.split("\n")) > MOST_DOTS:
-        raise ValueError(f"a line of it has more than {MOST_DOTS} dots; break it")
+    if max(line.count(".") for line in text.split("\n")) > MAX_DOTS:
+        raise ValueError(f"a line of it has more than {MAX_DOTS} dots; break it")
     try:
         return tomllib.loads(text)
     except RecursionError as error:

@@ -32,7 +32,7 @@ from cpp_client import (
 from daemon_process import SENSOR, DaemonProcess
 from fake_control import FakeControl
 from fuzz_targets import CONTACT, HEADER
-from tactomo.cli.children import Family
+from tactomo.cli.children import ProcessGroup
 from tactomo.stream import keys as key_files
 from tactomo_client import ClientError, Contact, ControlError, Frame, request, subscribe
 from tactomo_client.fake import FakeSensor
@@ -70,8 +70,8 @@ def checked() -> Path:
 @pytest.fixture(scope="module")
 def twin() -> Iterator[Mapping[str, Any]]:
     """What a running twin announces: its `ports`, and its `control` address."""
-    with Family() as family:
-        yield family.start("twin", "twin", "--announce", "--twin-control", ANYWHERE).wait_ready()
+    with ProcessGroup() as group:
+        yield group.start("twin", "twin", "--announce", "--twin-control", ANYWHERE).wait_ready()
 
 
 @pytest.fixture(scope="module")

@@ -15,10 +15,10 @@ from tactomo.recordings.recording import Origin
 from tactomo.recordings.recording_writer import (
     RecordingWriter,
     calibration_entry,
-    pack_mark,
+    pack_frame,
     reference_entry,
 )
-from tactomo.scans import Mark
+from tactomo.scans import FrameRecord
 from tactomo_client.recording_file import CHANNELS, PROFILE
 from tactomo_models import Flag, Press, Reference, SkinSimulator, load_description
 from tactomo_models.batch import reconstruct_file
@@ -89,7 +89,7 @@ def test_every_word_of_a_recordings_origin_has_its_row(tmp_path: Path) -> None:
 
 
 def test_every_field_of_what_is_recorded_has_its_row() -> None:
-    frame = msgpack.unpackb(pack_mark(Mark((), "auto", None)))
+    frame = msgpack.unpackb(pack_frame(FrameRecord((), "auto", None)))
     assert table(PAGE, "## A frame").keys() == frame.keys()
     scan = np.ones(3)
     whole = Reference(scan, scan, scan, scan, 1, scan, scan, scan, scan)

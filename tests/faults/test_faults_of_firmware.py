@@ -16,7 +16,7 @@ from foxglove_client import FoxgloveClient
 from hostile_board import HostileBoard
 from pty_skin import PtySkin, Scenes
 from stream_rules import Subscriber
-from tactomo.cli.children import Family
+from tactomo.cli.children import ProcessGroup
 from tactomo_client import subscribe
 from tactomo_models import SensorDescription
 from tactomo_ros2.live import run
@@ -83,8 +83,8 @@ Count = Callable[[], int]
 @contextmanager
 def foxglove(stream: str, _: Path) -> Iterator[Count]:
     """The bridge, and who looks through it."""
-    with Family() as family:
-        bridge = family.start(
+    with ProcessGroup() as group:
+        bridge = group.start(
             *("bridge", "foxglove", SENSOR, "--foxglove-port", "0", "--announce"),
             *("--address", stream),
         ).wait_ready()
@@ -99,8 +99,8 @@ def zenoh_bridge(stream: str, folder: Path) -> Iterator[Count]:
     apart = {"scouting": {"multicast": {"enabled": False}}}
     (folder / "robot.json5").write_text(json.dumps({**apart, "mode": "router", "listen": at}))
     (folder / "desk.json5").write_text(json.dumps({**apart, "mode": "client", "connect": at}))
-    with Family() as family:
-        family.start(*("zenoh", "zenoh", "--from", stream, "--config", str(folder / "robot.json5")))
+    with ProcessGroup() as group:
+        group.start(*("zenoh", "zenoh", "--from", stream, "--config", str(folder / "robot.json5")))
         wait_until((folder / "router").exists, "Zenoh to listen")
         session = zenoh.open(zenoh.Config.from_file(str(folder / "desk.json5")))
         heard: list[object] = []

@@ -11,7 +11,7 @@ import zmq
 from fixture_types import Figure
 from hostile_page import SUBSCRIBE, Attacker, HostileSite
 from selenium import webdriver
-from tactomo.cli.children import Family
+from tactomo.cli.children import ProcessGroup
 from tactomo.stream import keys as key_files
 from tactomo_client import request
 from tactomo_client.messages import encode_request
@@ -66,12 +66,12 @@ def test_a_hostile_page(attacker: Attacker, tmp_path: Path, figure: Figure, keys
     robot, desk = tmp_path / "robot", tmp_path / "desk"
     under = a_clients_keys(robot, desk) if keys == "with" else []
     ours = ["--keys", str(desk)] if under else []
-    with Family() as family:
-        skin = family.start(
+    with ProcessGroup() as group:
+        skin = group.start(
             *("twin", "twin", "--link", str(tmp_path), "--twin-control", ANYWHERE, "--announce")
         ).wait_ready()
         lines = [word for path in skin["ports"] for word in ("--port", path)]
-        daemon = family.start(
+        daemon = group.start(
             *("daemon", "daemon", "--sensor", SENSOR, *lines, *under),
             *("--stream", ANYWHERE, "--control", ANYWHERE),
         ).wait_ready()
@@ -90,11 +90,11 @@ def test_a_hostile_page(attacker: Attacker, tmp_path: Path, figure: Figure, keys
             after["subscribers"] != before["subscribers"],
             request("scene", twin, PATIENCE_S)["presses"] != [],
         ]
-        page = family.start(
+        page = group.start(
             *("viewer", "viewer", "--sensor", SENSOR, "--viewer-port", "0", *ours),
             *("--address", stream, "--control", control, "--twin-control", twin),
         ).wait_ready()["url"]
-        bridge = family.start(
+        bridge = group.start(
             *("bridge", "foxglove", SENSOR, "--foxglove-port", "0", "--announce", *ours),
             *("--address", stream),
         ).wait_ready()["url"]

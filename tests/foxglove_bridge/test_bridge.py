@@ -19,7 +19,7 @@ import pytest
 from foxglove_client import PROTOCOL, FoxgloveClient
 from fuzz_targets import ENVELOPE
 from recorded_grasp import contacts_of, images_of
-from tactomo.cli.children import Family
+from tactomo.cli.children import ProcessGroup
 from tactomo.imaging.frames import description_fields
 from tactomo_client import Contact, MessageError
 from tactomo_client.fake import FakeSensor
@@ -271,8 +271,8 @@ def test_an_address_that_is_taken(sensor: FakeSensor) -> None:
 
 def test_the_command_serves_until_it_is_stopped(sensor: FakeSensor, tmp_path: Path) -> None:
     layout = tmp_path / "left.json"
-    with Family() as family:
-        bridge = family.start(
+    with ProcessGroup() as group:
+        bridge = group.start(
             *("bridge", "foxglove", "left", "--address", sensor.address, "--announce"),
             *("--foxglove-port", "0", "--layout", str(layout)),
         )

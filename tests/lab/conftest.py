@@ -9,7 +9,7 @@ import pytest
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark those of this folder, before any is left out by its marks."""
+    """FrameRecord those of this folder, before any is left out by its marks."""
     for item in items:
         if Path(__file__).parent in item.path.parents:
             item.add_marker("lab")

@@ -30,12 +30,12 @@ from tactomo.recordings.recording import Origin, open_recording
 from tactomo.recordings.recording_writer import (
     Entry,
     RecordingWriter,
-    mark_entry,
+    frame_entry,
     port_entry,
     preamble_entry,
     reference_entry,
 )
-from tactomo.scans import Mark, ScanKey
+from tactomo.scans import FrameRecord, ScanKey
 from tactomo.stream.control import COMMANDS
 from tactomo.twin import control as twin_control
 from tactomo.twin.scene import SHIPPED, load_scene
@@ -238,7 +238,7 @@ def _recording_examples() -> list[bytes]:
     writer.add(Entry(MAP, encode_message("left", MAP, HEADER), 4, 4))
     writer.add(Entry(CONTACTS, contacts, 4, 4))
     key = ScanKey(Channel.STRUCTURE, 7, 350_000)
-    writer.add(mark_entry(Mark((key,), "fit", 4.0, reference_number=1), 5, 5))
+    writer.add(frame_entry(FrameRecord((key,), "fit", 4.0, reference_number=1), 5, 5))
     writer.flush()
     cut = path.read_bytes()
     writer.close()

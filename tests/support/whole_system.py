@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 from daemon_process import DaemonProcess
-from tactomo.cli.children import Family
+from tactomo.cli.children import ProcessGroup
 from tactomo_client import Frame, request, subscribe
 from variants import rewritten
 from waiting import PATIENCE_S, wait_until
@@ -126,8 +126,8 @@ def paper_twin(folder: Path, *changes: tuple[str, str]) -> Iterator[dict[str, li
 @contextmanager
 def twin_of(description: Path, ports: Path) -> Iterator[dict[str, list[str]]]:
     """Run `tactomo twin` of a description file, its ports in a folder; yields what it announces."""
-    with Family() as family:
-        announced = family.start(
+    with ProcessGroup() as group:
+        announced = group.start(
             *("twin", "twin", "--announce", "--twin-control", ANYWHERE),
             *("--description", str(description), "--link", str(ports), "--rate", "10"),
         ).wait_ready()

@@ -1,9 +1,9 @@
 """The bridge: what a daemon publishes, served over Foxglove's WebSocket protocol.
 
 One thread, `run`'s caller, reads the stream and draws; foxglove-sdk's own threads send to whoever
-looks, through a door (`door`) that no web page but Foxglove's passes. Each of those who look has a
-queue of a second or so, of which the oldest is dropped: who is slow sees the newest, and nobody
-waits. Nothing that a client sends reaches the daemon.
+looks, through a proxy (`origin_proxy`) that no web page but Foxglove's passes. Each of those who
+look has a queue of a second or so, of which the oldest is dropped: who is slow sees the newest, and
+nobody waits. Nothing that a client sends reaches the daemon.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from tactomo_client.messages import (
     topic,
 )
 
-from tactomo_foxglove.door import FOXGLOVE_ORIGIN, Door, hidden_address
+from tactomo_foxglove.origin_proxy import FOXGLOVE_ORIGIN, OriginProxy, hidden_address
 from tactomo_foxglove.topics import SensorTopics
 
 DEFAULT_HOST: Final = "127.0.0.1"
@@ -194,10 +194,10 @@ class _Problem:
 
 def _serve(
     sensors: Sequence[str], host: str, port: int, origins: Sequence[str], context: foxglove.Context
-) -> tuple[Door, WebSocketServer]:
+) -> tuple[OriginProxy, WebSocketServer]:
     behind = hidden_address()
     try:
-        door = Door(host, port, {FOXGLOVE_ORIGIN, *origins})
+        proxy = OriginProxy(host, port, {FOXGLOVE_ORIGIN, *origins})
         server = foxglove.start_server(
             name=f"tactomo: {', '.join(sensors)}",
             host=behind,
@@ -211,5 +211,5 @@ def _serve(
             "stop the program that uses it, or give another with --foxglove-port (0: a free one)",
             name="cannot_listen",
         ) from error
-    door.open(behind, server.port)
-    return door, server
+    proxy.open(behind, server.port)
+    return proxy, server

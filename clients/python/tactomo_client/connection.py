@@ -137,7 +137,7 @@ class Connection:
         """
         return self.handshakes.refusal(self.address, self._keys) if self.is_open else None
 
-    def knock_again(self) -> KeysError | None:
+    def retry_refused_connection(self) -> KeysError | None:
         """Return why the server does not let us in, if so, and try again from time to time.
 
         ZeroMQ itself never tries again where a key was refused.

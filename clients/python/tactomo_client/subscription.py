@@ -125,7 +125,7 @@ class Reception(Generic[T_co]):
             if is_there:
                 if (item := self._receive()) is not None:
                     return item
-            elif refusal := connection.knock_again():
+            elif refusal := connection.retry_refused_connection():
                 raise refusal
             if time.monotonic() >= deadline_s:
                 break
@@ -139,7 +139,7 @@ class Reception(Generic[T_co]):
         while connection.socket.poll(0):
             self._receive()
         if self.is_stale:
-            connection.knock_again()
+            connection.retry_refused_connection()
         return self._newest
 
     def _end(self) -> StreamTimeout | None:

@@ -17,7 +17,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Final
 
-from tactomo.timing import FEW, LONGEST_PERIOD_S, Pace
+from tactomo.timing import LATE_PERIODS, LONGEST_PERIOD_S, Pace
 
 PATIENCE_S: Final = 3.0
 """A device says hello every second; without a word for so long it counts as silent, and without a
@@ -32,7 +32,7 @@ class DeviceState(StrEnum):
     STARTING = "starting"  # opened a moment ago
     RUNNING = "running"  # scans come
     IDLE = "idle"  # it speaks, but sends no scans
-    GARBAGE = "garbage"  # bytes come, but no packet
+    GARBLED = "garbage"  # bytes come, but no packet
     SILENT = "silent"  # nothing comes
 
 
@@ -72,7 +72,7 @@ class Liveness:
 
     def note_rate(self, rate_hz: float) -> None:
         """Take note of the scans a second that the device says it sends; 0 for no steady rate."""
-        self._stated_s = FEW * min(1 / rate_hz, LONGEST_PERIOD_S) if rate_hz > 0 else 0.0
+        self._stated_s = LATE_PERIODS * min(1 / rate_hz, LONGEST_PERIOD_S) if rate_hz > 0 else 0.0
 
     def opened(self, now_s: float) -> None:
         """Take note that a device was plugged in: it gets its time to answer."""
@@ -111,16 +111,16 @@ class Liveness:
             self.state = DeviceState.SILENT
         elif self._packet_s < since_s:  # what comes may yet become a packet
             if now_s - since_s >= self.silence_s:
-                self.state = DeviceState.GARBAGE
+                self.state = DeviceState.GARBLED
         elif now_s - self._packet_s >= self.silence_s:
-            self.state = DeviceState.GARBAGE
+            self.state = DeviceState.GARBLED
         elif now_s - self._scan_s >= self.patience_s:
             self.state = DeviceState.IDLE
         return self.state
 
     def is_reopening_due(self, now_s: float) -> bool:
         """Whether to close the port and open it again now; if so, the next time comes later."""
-        is_mute = self.state in (DeviceState.SILENT, DeviceState.GARBAGE)
+        is_mute = self.state in (DeviceState.SILENT, DeviceState.GARBLED)
         if not is_mute or now_s < self._reopen_s:
             return False
         self._reopen_wait_s = min(2 * self._reopen_wait_s, REOPEN_MOST_S)

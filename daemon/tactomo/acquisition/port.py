@@ -39,7 +39,7 @@ from tactomo.protocols import PortProtocol, Trouble
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording_writer import ActiveRecording, port_entry, preamble_entry
 from tactomo.recordings.replay import Playback
-from tactomo.scans import ChannelScan, Delivery
+from tactomo.scans import ChannelScan, PortRead
 from tactomo.timing import wall_clock_ns
 from tactomo.worker import Worker
 
@@ -55,7 +55,7 @@ TROUBLES: Final = {
         "device_silent",
         "check the device's power; the daemon asks again and reopens the port",
     ),
-    DeviceState.GARBAGE: (
+    DeviceState.GARBLED: (
         "device_garbled",
         "wrong baud rate, or another device: set `baud` or `protocol` to the device's; "
         "`tactomo ports --ask` tells what is where",
@@ -79,7 +79,7 @@ class PortReader(Worker):
     _description: SensorDescription  # the sensor that the device must fit
     _device_ids: Collection[str]  # those that may speak here; any where it is empty
     _recorder: Recorder  # gets every byte while it records
-    _deliver: Callable[[Delivery], None]  # called by the thread with what each read brought
+    _deliver: Callable[[PortRead], None]  # called by the thread with what each read brought
     _on_event: OnEvent  # told what happens
     _playback: Playback | None  # the replay's time, where the port replays
     _carriers: dict[Channel, PortReader]  # which port carries a channel
@@ -249,7 +249,7 @@ class PortReader(Worker):
         self._liveness.heard(now_s, intact, found)
         if packets:
             self._deliver(
-                Delivery(self.index, clock_ns, tuple(scans), self.hello, replay_pass=self._pass)
+                PortRead(self.index, clock_ns, tuple(scans), self.hello, replay_pass=self._pass)
             )
         if self._playback is None:
             self._send(self.protocol.replies())
@@ -415,7 +415,7 @@ class PortReader(Worker):
         hello = self.hello
         if state is DeviceState.SILENT:
             return f"nothing came for {self._liveness.silence_s:.3g} s or longer"
-        if state is DeviceState.GARBAGE:
+        if state is DeviceState.GARBLED:
             return (
                 f"bytes come, but no packet of protocol {self.protocol.name} at {self._baud} baud"
             )
@@ -450,7 +450,7 @@ class PortReader(Worker):
 
     def _end(self) -> None:
         self.has_ended = True
-        self._deliver(Delivery(self.index, 0, (), has_ended=True, replay_pass=self._pass))
+        self._deliver(PortRead(self.index, 0, (), has_ended=True, replay_pass=self._pass))
 
     def _begin_pass(self, number: int) -> None:
         """Go on elsewhere in the recording: what had begun to come is not finished."""

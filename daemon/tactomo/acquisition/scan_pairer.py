@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 
 from tactomo_protocol import SCAN_COUNTERS, Channel
 
-from tactomo.scans import ChannelScan, DualScan, Mark, ScanKey
+from tactomo.scans import ChannelScan, DualScan, FrameRecord, ScanKey
 
 LOST_AFTER_NS: Final = 1_000_000_000
 LOST_AFTER_FRAMES: Final = 3
@@ -228,13 +228,13 @@ class CounterPairer(ScanPairer):
         return next(other for other in self._expected if other != channel)
 
 
-class MarkPairer(ScanPairer):
+class RecordPairer(ScanPairer):
     """Pairs exactly those scans that a recording's marks pair, in their order, without waiting.
 
     Late are scans whose partner's bytes are not in the recording.
     """
 
-    def __init__(self, marks: list[Mark]) -> None:
+    def __init__(self, marks: list[FrameRecord]) -> None:
         super().__init__()
         self._marks = marks
         self._next = 0  # the mark to be sent on next
@@ -281,7 +281,7 @@ class MarkPairer(ScanPairer):
         return [_dual(*scans, mark=mark)]
 
 
-def _dual(*scans: ChannelScan | None, mark: Mark | None = None) -> DualScan:
+def _dual(*scans: ChannelScan | None, mark: FrameRecord | None = None) -> DualScan:
     by_channel = {scan.channel: scan for scan in scans if scan is not None}
     counter = next(iter(by_channel.values())).counter
     return DualScan(

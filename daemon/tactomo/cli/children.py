@@ -29,10 +29,12 @@ STOP_S = 10.0
 START_S = 180.0
 
 
-class Child:
+class ManagedProcess:
     """One running `tactomo` command."""
 
-    def __init__(self, name: str, arguments: list[str], ended: queue.SimpleQueue[Child]) -> None:
+    def __init__(
+        self, name: str, arguments: list[str], ended: queue.SimpleQueue[ManagedProcess]
+    ) -> None:
         self.name = name
         self._lines: collections.deque[str] = collections.deque(maxlen=KEPT_LINES)
         self._ready: Mapping[str, Any] | None = None
@@ -124,19 +126,19 @@ class Child:
         self._ended.put(self)
 
 
-class Family:
+class ProcessGroup:
     """Children that are stopped together when the block ends, however it ends."""
 
     def __init__(self) -> None:
-        self._children: list[Child] = []
-        self._ended: queue.SimpleQueue[Child] = queue.SimpleQueue()
+        self._children: list[ManagedProcess] = []
+        self._ended: queue.SimpleQueue[ManagedProcess] = queue.SimpleQueue()
 
-    def start(self, name: str, *arguments: str) -> Child:
+    def start(self, name: str, *arguments: str) -> ManagedProcess:
         """Start one child."""
-        self._children.append(Child(name, list(arguments), self._ended))
+        self._children.append(ManagedProcess(name, list(arguments), self._ended))
         return self._children[-1]
 
-    def wait_for_an_end(self) -> Child:
+    def wait_for_an_end(self) -> ManagedProcess:
         """Wait until a child has ended that has not done what it was for, and return it."""
         while (child := self._ended.get()).status == 0 and not child.is_lasting:
             pass
@@ -165,10 +167,10 @@ def no_interruption() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def new_family() -> Family:
-    """Return a new family, which any signal to end ends as Ctrl-C does."""
+def new_group() -> ProcessGroup:
+    """Return a new group, which any signal to end ends as Ctrl-C does."""
     interrupt_at_end()
-    return Family()
+    return ProcessGroup()
 
 
 def interrupt_at_end() -> None:

@@ -33,13 +33,13 @@ from tactomo.events import OnEvent
 from tactomo.imaging import frames
 from tactomo.imaging.calibration_in_force import CalibrationInForce
 from tactomo.imaging.companions import Companions, FrozenConverters
-from tactomo.imaging.frame_marks import FrameMarks, InForce
+from tactomo.imaging.frame_log import FrameLog, InForce
 from tactomo.imaging.kept_reference import KeptReference, KnownSkin
 from tactomo.imaging.method_in_force import Effort, MethodInForce, ProcessorShare
 from tactomo.imaging.tare import Taring
 from tactomo.plain import counted
 from tactomo.recordings.recorder import Recorder
-from tactomo.scans import DualScan, Mark, Timing, Volts
+from tactomo.scans import DualScan, FrameRecord, Timing, Volts
 from tactomo.stream.publisher import Publisher
 from tactomo.timing import Durations, Rate, wall_clock_ns
 
@@ -97,7 +97,7 @@ class Imaging:
         self._tracker = (
             BaselineTracker(reconstructor, baseline.time_constant_s) if baseline.track else None
         )
-        self._marks = FrameMarks(recorder)
+        self._marks = FrameLog(recorder)
         self.method = MethodInForce(reconstructor)  # requested and effective
         # of pressure, the one in force
         self.calibration = CalibrationInForce(
@@ -367,7 +367,7 @@ class Imaging:
             "the skin is at rest by the reference before the tare, which is used again",
         )
 
-    def _obey(self, mark: Mark) -> None:
+    def _obey(self, mark: FrameRecord) -> None:
         """Put in force what was in force when this dual scan was recorded."""
         self.method.obey(Effort(mark.tier, mark.budget_ms))
         if mark.is_cold:

@@ -23,14 +23,14 @@ from tactomo_models.calibration.calibration_file import PressureCalibration
 from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_protocol import Channel, Hello
 
-from tactomo.acquisition.scan_pairer import CounterPairer, MarkPairer, ScanPairer
+from tactomo.acquisition.scan_pairer import CounterPairer, RecordPairer, ScanPairer
 from tactomo.acquisition.skew import Skew
 from tactomo.errors import CommandError
 from tactomo.events import OnEvent, RateLimit, Rises, times
 from tactomo.imaging.imaging import Imaging
 from tactomo.plain import counted
 from tactomo.recordings.replay import Replay, ReplayClock
-from tactomo.scans import Delivery, DualScan
+from tactomo.scans import DualScan, PortRead
 from tactomo.timing import LATEST_NS, Rate, wall_clock_ns
 from tactomo.worker import Worker
 
@@ -120,7 +120,7 @@ class Pipeline(Worker):
         self._announced: dict[int, Hello] = {}  # what each port's device says of itself
         self._begun: set[Channel] = set()  # channels that have been in a dual scan
         self._replay_clock = None if replay is None else ReplayClock(self._ports, replay.is_paced)
-        self._deliveries: queue.Queue[Delivery | None] = queue.Queue(
+        self._deliveries: queue.Queue[PortRead | None] = queue.Queue(
             QUEUED_DELIVERIES if replay is None else QUEUED_OF_REPLAY
         )
         self._overflow_lock = threading.Lock()
@@ -157,7 +157,7 @@ class Pipeline(Worker):
             "dropped": self._left_out + sync.unmarked,
         }
 
-    def deliver(self, delivery: Delivery) -> None:
+    def deliver(self, delivery: PortRead) -> None:
         """Take what a port read; called by port threads. Waits only if nothing may be lost."""
         if delivery.scans:
             self._received[delivery.port].update(scan.channel for scan in delivery.scans)
@@ -252,7 +252,7 @@ class Pipeline(Worker):
     def _new_sync(self) -> ScanPairer:
         replay = self._replay
         if replay is not None and replay.marks:
-            return MarkPairer(replay.marks_of_pass())
+            return RecordPairer(replay.marks_of_pass())
         return CounterPairer(self._channels, self._sync_wait_ns)
 
     def _move(self, position_s: float) -> dict[str, Any]:
@@ -319,7 +319,7 @@ class Pipeline(Worker):
             return IDLE_S
         return min(IDLE_S, max(0.0, (deadline_ns - time.monotonic_ns()) * 1e-9))
 
-    def _join(self, delivery: Delivery) -> list[DualScan]:
+    def _join(self, delivery: PortRead) -> list[DualScan]:
         ready: list[DualScan] = []
         self._joined += len(delivery.scans)
         if self._replay is not None and delivery.replay_pass != self._replay.playback.passes:
@@ -339,7 +339,7 @@ class Pipeline(Worker):
                 ready += self.sync.advance(now_ns)
         return ready
 
-    def _note_device(self, delivery: Delivery) -> None:
+    def _note_device(self, delivery: PortRead) -> None:
         """Do not wait for a channel that no device says it sends; a calibration is of a device."""
         if delivery.hello is None or self._announced.get(delivery.port) == delivery.hello:
             return

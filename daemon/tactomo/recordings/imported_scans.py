@@ -37,7 +37,7 @@ from tactomo.recordings.eit_files import SUFFIX, eit_files, read_eit_files
 from tactomo.scans import MAX_QUADRATURE
 
 # Of times and electrodes' numbers: seconds since 1970 until 2096.
-MOST = 4e9
+MAX_TIME_S = 4e9
 SLOWEST_HZ, FASTEST_HZ = 1e-3, 1e6  # what a hello can say
 SIGN_SCANS = 4096  # of a longer file, so many tell the signs
 TURNED_ROUND = 0.9  # share of voltages of the wrong sign; under an object few change theirs
@@ -405,6 +405,6 @@ def _checked(
     path: Path, name: str, array: NDArray[Any], shape: tuple[int | None, ...]
 ) -> FloatArray:
     numbers = checked(path, name, array, shape)
-    if not numbers.size or not np.all(np.abs(numbers) <= MOST):
+    if not numbers.size or not np.all(np.abs(numbers) <= MAX_TIME_S):
         raise TactomoError(f"{path}: {name} holds what is out of range", "correct it")
     return numbers

@@ -32,7 +32,7 @@ from tactomo_protocol import Channel, Hello, Packet, Scan
 from tactomo.errors import ConfigError, RecordingError
 from tactomo.protocols import NATIVE, PortProtocol, protocol_named
 from tactomo.recordings.record_fields import read_reference_number
-from tactomo.scans import Mark
+from tactomo.scans import FrameRecord
 
 if TYPE_CHECKING:  # `tactomo info` starts in half the time without
     from tactomo_models import Reference, SensorDescription
@@ -205,11 +205,11 @@ class Recording:
             for packet in protocol.feed(data):
                 yield clock_ns, packet
 
-    def marks(self) -> list[Mark]:
+    def marks(self) -> list[FrameRecord]:
         """Return the dual scans that were reconstructed, each with what was new just before it."""
-        from tactomo.recordings.records import read_calibration, read_mark, read_reference
+        from tactomo.recordings.records import read_calibration, read_frame, read_reference
 
-        marks: list[Mark] = []
+        marks: list[FrameRecord] = []
         reference: Reference | None = None
         calibration: str | None = None
         number: int | None = None
@@ -221,7 +221,7 @@ class Recording:
             elif topic == "calibration":
                 calibration = read_calibration(message.data).text
             elif topic == "frame":
-                mark = read_mark(message.data)
+                mark = read_frame(message.data)
                 at_ns = message.log_time
                 marks.append(
                     replace(mark, reference=reference, calibration=calibration, clock_ns=at_ns)

@@ -28,7 +28,7 @@ from tactomo_protocol import CompanionReading, Hello, Scan, encode
 from tactomo.errors import RecordingError
 from tactomo.recordings.recording import REPLAY_SCHEME, Origin
 from tactomo.recordings.records import DRIFT_ARRAYS, REFERENCE_ARRAYS
-from tactomo.scans import Mark
+from tactomo.scans import FrameRecord
 from tactomo.timing import wall_clock_ns
 
 CHUNK_NS: Final = 200_000_000
@@ -78,12 +78,12 @@ def calibration_entry(text: str, number: int, monotonic_ns: int, realtime_ns: in
     return Entry("calibration", data, monotonic_ns, realtime_ns)
 
 
-def mark_entry(mark: Mark, monotonic_ns: int, realtime_ns: int) -> Entry:
+def frame_entry(mark: FrameRecord, monotonic_ns: int, realtime_ns: int) -> Entry:
     """A dual scan that was reconstructed; a new reference is an entry of its own, before it."""
-    return Entry("frame", pack_mark(mark), monotonic_ns, realtime_ns)
+    return Entry("frame", pack_frame(mark), monotonic_ns, realtime_ns)
 
 
-def pack_mark(mark: Mark) -> bytes:
+def pack_frame(mark: FrameRecord) -> bytes:
     """Return a mark as it is written."""
     fields = {
         "scans": [(key.channel.number, key.counter, key.device_us) for key in mark.scans],

@@ -16,7 +16,7 @@ from tactomo_models.calibration.calibration_file import PressureCalibration, par
 from tactomo_protocol import Channel
 
 from tactomo.recordings.record_fields import malformed, record_fields
-from tactomo.scans import Mark, ScanKey, Timing
+from tactomo.scans import FrameRecord, ScanKey, Timing
 
 REFERENCE_ARRAYS: Final = ("magnitude", "structure", "magnitude_noise", "structure_noise")
 DRIFT_ARRAYS: Final = tuple(f"{c}_{what}" for what in ("drift", "creep") for c in Channel)
@@ -85,15 +85,15 @@ def recorded_calibration(
     return None if found.subject.mismatch(found.subject.sensor, description) else found
 
 
-def read_mark(data: bytes) -> Mark:
+def read_frame(data: bytes) -> FrameRecord:
     """Read a message of the topic ``frame``; raise RecordingError where it is none."""
-    mark = _checked(_Mark, record_fields(data))
+    mark = _checked(_FrameRecord, record_fields(data))
     try:
         keys = [ScanKey(Channel.of_number(c), counter, device) for c, counter, device in mark.scans]
     except ValueError as error:
         raise malformed() from error
     timing = None if mark.timing is None else Timing(*mark.timing)
-    return Mark(
+    return FrameRecord(
         tuple(keys),
         OLD_METHODS.get(mark.tier, mark.tier),
         mark.budget_ms,
@@ -105,7 +105,7 @@ def read_mark(data: bytes) -> Mark:
     )
 
 
-class _Mark(BaseModel):
+class _FrameRecord(BaseModel):
     scans: list[tuple[StrictInt, StrictInt, StrictInt]]
     tier: StrictStr
     budget_ms: Annotated[float, Strict()] | None

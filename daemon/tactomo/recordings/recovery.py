@@ -30,8 +30,8 @@ from tactomo.errors import RecordingError
 from tactomo.protocols import PortProtocol
 from tactomo.recordings.record_fields import read_reference_number
 from tactomo.recordings.recording import RECOVERED, Origin, open_file, open_recording, to_origin
-from tactomo.recordings.recording_writer import RecordingWriter, pack_mark
-from tactomo.recordings.records import read_calibration, read_mark
+from tactomo.recordings.recording_writer import RecordingWriter, pack_frame
+from tactomo.recordings.records import read_calibration, read_frame
 from tactomo.scans import ScanKey
 
 _REMEMBERED_SCANS: Final = 1024
@@ -208,7 +208,7 @@ class _Salvage:
 
     def _mend(self, data: bytes) -> bytes | None:
         """Return what a mark after a gap says now; None where a replay could not follow it."""
-        mark = read_mark(data)
+        mark = read_frame(data)
         in_force = (mark.reference_number, mark.calibration_number)
         is_known = in_force == (self._reference, self._calibration)
         if not is_known or not all(key in self._scans for key in mark.scans):
@@ -216,7 +216,7 @@ class _Salvage:
             return None
         if self._starts_cold:
             mark, self._starts_cold = replace(mark, is_cold=True), False
-        return pack_mark(mark)
+        return pack_frame(mark)
 
 
 def _ends_well(file: IO[bytes], end: int) -> bool:

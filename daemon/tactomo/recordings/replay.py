@@ -22,7 +22,7 @@ from tactomo.errors import ConfigError, PortError
 from tactomo.plain import counted
 from tactomo.recordings.recording import REPLAY_SCHEME, Recording, open_recording
 from tactomo.recordings.records import calibration_text, recorded_calibration
-from tactomo.scans import Delivery, Mark
+from tactomo.scans import FrameRecord, PortRead
 
 MAX_LAG_S: Final = 0.25
 """How late bytes may be read before the replay waits for whoever reads them."""
@@ -176,7 +176,8 @@ class Playback:
 class Replay:
     """What a recording tells the pipeline beyond the bytes on the ports."""
 
-    marks: list[Mark]  # the dual scans to reconstruct; empty where the recording does not say
+    # the dual scans to reconstruct; empty where the recording does not say
+    marks: list[FrameRecord]
     reference: Reference | None  # the one in force at its beginning
     is_paced: bool  # whether bytes come in their own time rather than as fast as they are taken
     playback: Playback  # its time, which the ports share
@@ -191,7 +192,7 @@ class Replay:
         """Whether every dual scan is reconstructed: those that were, or as fast as they come."""
         return bool(self.marks) or not self.is_paced
 
-    def marks_of_pass(self) -> list[Mark]:
+    def marks_of_pass(self) -> list[FrameRecord]:
         """Return the marks from where the playback's pass began on.
 
         Of a pass that is not the first, the first mark brings what was in force.
@@ -233,7 +234,7 @@ class ReplayClock:
         """Whether every port is at its end."""
         return len(self._ended) == self._ports
 
-    def follow(self, delivery: Delivery) -> int | None:
+    def follow(self, delivery: PortRead) -> int | None:
         """Take note of what a port said; return the time that has passed, None if none is sure."""
         if delivery.has_ended:
             self._ended.add(delivery.port)
@@ -315,12 +316,12 @@ def parse_replay_url(url: str) -> tuple[Recording, int, float]:
     return recording, port, speed
 
 
-def without_calibrations(marks: Sequence[Mark]) -> list[Mark]:
+def without_calibrations(marks: Sequence[FrameRecord]) -> list[FrameRecord]:
     """Return marks that leave the pressure calibration as it is."""
     return [replace(mark, calibration=None) for mark in marks]
 
 
-def _last_ns(marks: Sequence[Mark]) -> int | None:
+def _last_ns(marks: Sequence[FrameRecord]) -> int | None:
     """Return from when on the bytes of the last dual scan came: after those of the one before."""
     before = [mark.clock_ns for mark in marks if mark.clock_ns < marks[-1].clock_ns]
     return max(before) + 1 if before else None

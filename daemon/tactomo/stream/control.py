@@ -28,7 +28,7 @@ from tactomo.events import OnEvent
 from tactomo.stream.access_control import CONTROL
 from tactomo.stream.commands import Arguments, Nothing, obey
 from tactomo.stream.peers import Peers
-from tactomo.worker import Bell, Worker
+from tactomo.worker import Wakeup, Worker
 
 POLL_MS: Final = 250  # between looks at what is idle
 POLL_WHILE_PENDING_MS: Final = 10
@@ -148,7 +148,7 @@ class Control(Worker):
         self._unread: list[_Unread] = []
         self._socket: zmq.Socket[bytes]
         self._peers: Peers
-        self._bell: Bell
+        self._wakeup: Wakeup
         self._cut = threading.Event()
 
     def open(
@@ -162,7 +162,7 @@ class Control(Worker):
         self._socket.setsockopt(zmq.ROUTER_MANDATORY, 1)  # a full queue is told, not thrown away
         self._peers = Peers(self._socket, endpoint, CONTROL, self._on_event, secret)
         self.address = self._peers.address
-        self._bell = Bell()
+        self._wakeup = Wakeup()
 
     def cut_connections(self) -> None:
         """Have every client connect anew, those who still may; for any thread."""
@@ -172,22 +172,22 @@ class Control(Worker):
     def _close(self) -> None:
         self._peers.close()
         self._socket.close(LINGER_MS)
-        self._bell.close()
+        self._wakeup.close()
 
     def _wake(self) -> None:
-        self._bell.ring()
+        self._wakeup.set()
 
     def _run(self) -> None:
         poller = zmq.Poller()
         poller.register(self._socket, zmq.POLLIN)
         poller.register(self._peers.monitor, zmq.POLLIN)
-        poller.register(self._bell.reader, zmq.POLLIN)
+        poller.register(self._wakeup.reader, zmq.POLLIN)
         while not self._stopping.is_set():
             self.turns += 1
             waits = self._pending or self._unread
             longest_ms = POLL_WHILE_PENDING_MS if waits else POLL_MS
             ready = dict(poller.poll(self._peers.wait_ms(longest_ms)))
-            self._bell.hear()
+            self._wakeup.drain()
             if self._socket in ready:
                 self._receive()
             self._answer_pending()

@@ -24,7 +24,7 @@ from tactomo.events import OnEvent
 from tactomo.stream.access_control import STREAM
 from tactomo.stream.peers import SUBSCRIBERS_CUT, Subscribers
 from tactomo.timing import Durations
-from tactomo.worker import Bell, Worker
+from tactomo.worker import Wakeup, Worker
 
 STATUS_PERIOD_S: Final = 1.0
 LINGER_MS: Final = 200  # how long messages that were sent may take to leave when the daemon stops
@@ -75,7 +75,7 @@ class Publisher(Worker):
         self._cut = threading.Event()
         self._status_asked = threading.Event()
         self._socket: zmq.Socket[bytes]
-        self._bell: Bell | None = None  # until it is open
+        self._wakeup: Wakeup | None = None  # until it is open
 
     def open(
         self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, secret: bytes | None = None
@@ -85,13 +85,13 @@ class Publisher(Worker):
         self._socket.setsockopt(zmq.SNDHWM, QUEUED_PER_SUBSCRIBER)
         self._readers = Subscribers(self._socket, endpoint, STREAM, self._on_event, secret)
         self.address = self._readers.peers.address
-        self._bell = Bell()
+        self._wakeup = Wakeup()
 
     def _close(self) -> None:
         self._readers.peers.close()
         self._socket.close(LINGER_MS)
-        if self._bell is not None:
-            self._bell.close()
+        if self._wakeup is not None:
+            self._wakeup.close()
 
     def cut_connections(self) -> None:
         """Have every subscriber connect anew, those who still may; for any thread."""
@@ -168,8 +168,8 @@ class Publisher(Worker):
     def _run(self) -> None:
         poller = zmq.Poller()
         poller.register(self._socket, zmq.POLLIN)
-        assert self._bell is not None
-        poller.register(self._bell.reader, zmq.POLLIN)
+        assert self._wakeup is not None
+        poller.register(self._wakeup.reader, zmq.POLLIN)
         poller.register(self._readers.peers.monitor, zmq.POLLIN)
         status_at_s = time.monotonic()
         while not self._stopping.is_set():
@@ -178,8 +178,8 @@ class Publisher(Worker):
             for ready, _ in poller.poll(self._readers.peers.wait_ms(status_in_ms)):
                 if ready is self._socket:
                     self._read_subscriptions()
-                elif ready == self._bell.reader.fileno():
-                    self._bell.hear()
+                elif ready == self._wakeup.reader.fileno():
+                    self._wakeup.drain()
             self._send_queued()
             if self._cut.is_set():
                 self._cut.clear()
@@ -221,5 +221,5 @@ class Publisher(Worker):
             self._socket.send(self._last_status, zmq.DONTWAIT)
 
     def _wake(self) -> None:
-        if self._bell is not None:
-            self._bell.ring()
+        if self._wakeup is not None:
+            self._wakeup.set()

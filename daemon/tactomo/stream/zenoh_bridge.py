@@ -87,9 +87,9 @@ class StreamInlet:
         self._missed_at_s = time.monotonic() + SILENT_S
         self._is_missed = False
 
-    def knock_again(self) -> None:
+    def retry_refused_connection(self) -> None:
         """Connect anew where we were not let in, and say so now and then."""
-        refusal = self._connection.knock_again()
+        refusal = self._connection.retry_refused_connection()
         if refusal is not None and refusal.name != self._told:
             tell(refusal.name, "error", refusal.cause, refusal.next_step)
         self._told = None if refusal is None else refusal.name
@@ -219,7 +219,7 @@ class ZenohBridge(Relay):
                 check_at_s = time.monotonic() + LOOK_S
                 self._publication.forget_silent()
                 for inlet in self._inlets:
-                    inlet.knock_again()
+                    inlet.retry_refused_connection()
 
     def close(self) -> None:
         """Close everything, whatever `open` came to."""

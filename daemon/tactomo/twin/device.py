@@ -59,7 +59,7 @@ from tactomo.twin.firmware import (
 from tactomo.twin.foreign import Emulator, ForeignFirmware
 from tactomo.twin.line import SerialLine
 from tactomo.twin.scene import Indenter, Scene, SkinDriftSettings
-from tactomo.worker import Bell
+from tactomo.worker import Wakeup
 
 # How often a line that nobody has open is looked at; its hang-up cannot be waited on.
 HANGUP_CHECK_S = 0.02
@@ -174,7 +174,7 @@ class Twin:
         self._converter = self._make_converter()
         self._powered_s = time.monotonic()
         self._firmware = self._make_firmware(ports)
-        self._bell = Bell()
+        self._wakeup = Wakeup()
         self._solver = ThreadPoolExecutor(max_workers=1, thread_name_prefix="twin-skin")
         self._thread = threading.Thread(target=self._run, name="twin-firmware")
         self._stopping = threading.Event()
@@ -198,7 +198,7 @@ class Twin:
     def stop(self) -> None:
         """Power down, close the lines and the control socket; may be called twice."""
         self._stopping.set()
-        self._bell.ring()
+        self._wakeup.set()
         if self._thread.ident is None:  # never started: the closing falls to us
             self._thread.start()
         self._thread.join()
@@ -227,14 +227,14 @@ class Twin:
             for port in self._firmware.ports:
                 port.line.close()
             self._control.close()
-            self._bell.close()
+            self._wakeup.close()
             self._ended.set()
 
     def _rest(self) -> None:
         """Wait until something is due, or the host, a client or the solver has something."""
         poller = zmq.Poller()
         poller.register(self._control.socket, zmq.POLLIN)
-        poller.register(self._bell.reader, zmq.POLLIN)
+        poller.register(self._wakeup.reader, zmq.POLLIN)
         timeout_s = self._firmware.due_in_s()
         for port in self._firmware.ports:
             if port.line.is_open:
@@ -242,7 +242,7 @@ class Twin:
             else:
                 timeout_s = min(timeout_s, HANGUP_CHECK_S)
         poller.poll(math.ceil(timeout_s * 1e3))
-        self._bell.hear()
+        self._wakeup.drain()
 
     def _clock(self) -> float:
         return time.monotonic() - self._powered_s
@@ -254,7 +254,7 @@ class Twin:
             self._play_at(time_s)
         presses = self._presses_at(time_s)
         future: Future[Voltages] = self._solver.submit(self._drifting.voltages, presses, time_s)
-        future.add_done_callback(lambda _: self._bell.ring())
+        future.add_done_callback(lambda _: self._wakeup.set())
         return future
 
     def _presses_at(self, time_s: float) -> list[Press]:

@@ -22,7 +22,7 @@ from tactomo_models.scans.tare import Tare
 # saturating sheet); most other sheets leave 0.40 or more, and deviate at most 1.32 times as much.
 LEFT_BY_CONTACTS: Final = 0.37
 LOADED_DEVIATION: Final = 1.5
-LEAST_DEVIATION: Final = 0.02  # that of a sheet uneven by 4 %: a better one may not stay alone
+MIN_DEVIATION: Final = 0.02  # that of a sheet uneven by 4 %: a better one may not stay alone
 
 
 class SkinAtStart(Enum):
@@ -90,7 +90,7 @@ def _left_by_contacts(reconstructor: Reconstructor, seen: Reference) -> float:
 def _deviation(volts: FloatArray, predicted: FloatArray) -> float:
     """How far voltages are from the model of the unloaded sheet, rms of logarithms, but a gain."""
     error = _log_ratio(volts, predicted)
-    return max(float(np.std(error)), LEAST_DEVIATION)
+    return max(float(np.std(error)), MIN_DEVIATION)
 
 
 def _log_ratio(volts: FloatArray, others: FloatArray) -> FloatArray:

@@ -30,19 +30,19 @@ from tactomo_models.sensor.description import SensorDescription
 
 MIN_PRESSES: Final = 20
 """Fifteen to learn from where five are judged; fewer tell no improvement from chance."""
-HELD_OUT: Final = 4  # parts, in order of time, each judged by what the others teach
-ODD: Final = 10.0
+HELD_OUT_PARTS: Final = 4  # parts, in order of time, each judged by what the others teach
+ODD_RATIO: Final = 10.0
 """Median errors from which the other presses contradict a press. Of five measured skins the worst
 of 800 good presses is 8.9 medians off, and of those with x and y swapped four in five are above."""
-OTHER_FRAME: Final = 0.5
+OTHER_FRAME_RATIO: Final = 0.5
 """Of the distance as given: coordinates in another frame or unit are nearer to the contacts."""
 
-LIKE: Final = (0.6, 1.6)
+FACTORS_AS_GIVEN: Final = (0.6, 1.6)
 """Factors between places and contacts that pass as the model's. It is off by 1 % on simulated
 hand-made skins; one doubled axis is 0.5."""
 TURNED_DEG: Final = 15.0  # likewise; 16 electrodes are 22 degrees apart
-SHIFTED: Final = 0.25  # likewise, of the skin's size; frames counted from a corner are off by 0.5
-KNOWN: Final = 0.5
+SHIFTED_SHARE: Final = 0.25  # likewise, of the skin's size; counted from a corner it is 0.5
+LEARNT_RATIO: Final = 0.5
 """Of the error that the middle of all places makes: what locates no better has learnt nothing.
 With shuffled places it is 1.0, of 100 presses on the worst of five measured skins 0.2."""
 
@@ -232,12 +232,12 @@ def _check_frame(xy_mm: FloatArray, guess_mm: FloatArray, description: SensorDes
     )
     size_mm = 1e3 * np.array([description.width_m, description.height_m])
     is_like = (
-        LIKE[0] < factors.min() <= factors.max() < LIKE[1]
+        FACTORS_AS_GIVEN[0] < factors.min() <= factors.max() < FACTORS_AS_GIVEN[1]
         and mirror > 0
         and abs(turn_deg) < TURNED_DEG
-        and (np.abs(shift_mm) < SHIFTED * size_mm).all()
+        and (np.abs(shift_mm) < SHIFTED_SHARE * size_mm).all()
     )
-    if there < OTHER_FRAME * as_given and not is_like:
+    if there < OTHER_FRAME_RATIO * as_given and not is_like:
         raise CalibrationError(
             f"places and contacts are {as_given:.0f} mm apart (median), and {there:.0f} mm if x is "
             f"multiplied by {factors[0]:.2g}, y by {mirror * factors[1]:.2g}, both are turned by "
@@ -262,7 +262,8 @@ def _check_order(xy_mm: FloatArray, guess_mm: FloatArray) -> None:
         gain = np.cumsum((own_mm - other_mm)[::-1])[::-1]
         first = int(gain.argmax())
         count = len(own_mm) - first
-        if count > 2 and np.median(other_mm[first:]) < OTHER_FRAME**2 * np.median(own_mm[first:]):
+        shifted_mm, as_given_mm = np.median(other_mm[first:]), np.median(own_mm[first:])
+        if count > 2 and shifted_mm < OTHER_FRAME_RATIO**2 * as_given_mm:
             raise CalibrationError(
                 f"from press {first} on (counted from 0), {count} places fit the contacts of the "
                 f"presses beside them: {why}; put the places right, or take them again"
@@ -278,7 +279,7 @@ def _odd(
     for found_mm in (guess_mm, PressRegression(changes, xy_mm).found_mm):
         off_mm = np.asarray(np.linalg.norm(found_mm - xy_mm, axis=1))
         median_mm = float(np.median(off_mm))
-        for k in np.flatnonzero(off_mm > ODD * median_mm) if median_mm < best_mm else ():
+        for k in np.flatnonzero(off_mm > ODD_RATIO * median_mm) if median_mm < best_mm else ():
             x, y = xy_mm[k]
             odd[numbers[k]] = f"press {numbers[k]} at ({x:.1f}, {y:.1f}) mm"
         best_mm = median_mm
@@ -287,8 +288,8 @@ def _odd(
 
 def _parts(count: int) -> list[BoolArray]:
     """Which presses (P,) are held out each time, in order of time."""
-    part = np.arange(count) * HELD_OUT // count
-    return [part == k for k in range(HELD_OUT)]
+    part = np.arange(count) * HELD_OUT_PARTS // count
+    return [part == k for k in range(HELD_OUT_PARTS)]
 
 
 def _judged_forces(
@@ -319,7 +320,7 @@ def _judged_forces(
 
     taught, physics = error_of(found_n), error_of(by_physics_n)
     alike = error_of(np.full(len(known), np.median(force_n)))
-    if taught < min(physics, KNOWN * alike):
+    if taught < min(physics, LEARNT_RATIO * alike):
         return taught, []
     others = "" if np.isinf(physics) else f"by the physics alone {physics:.0%}, "
     return np.nan, [
@@ -352,7 +353,7 @@ def _best(changes: FloatArray, xy_mm: FloatArray, guess_mm: FloatArray) -> tuple
             f"{without_mm:.2f} mm off; give more presses, spread over the skin"
         )
     middle_mm = float(np.median(np.linalg.norm(xy_mm - xy_mm.mean(axis=0), axis=1)))
-    if with_mm > KNOWN * middle_mm:
+    if with_mm > LEARNT_RATIO * middle_mm:
         raise CalibrationError(
             f"nothing is kept: places are {with_mm:.1f} mm off (median) as taught, and would be "
             f"{middle_mm:.1f} mm off if all were in the middle of all: places and voltages do not "

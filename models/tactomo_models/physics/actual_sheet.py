@@ -48,8 +48,8 @@ WARMING = 0.1  # of a sheet's conductivity since the tare: 5 K at 2 % per kelvin
 UNEVEN_DRIFT = 0.01  # likewise from place to place; 0.02 explains scans that are one apart, too
 DISPLACED_M = 1e-3  # of an electrode along the rim
 REACH = 0.4  # radius that an electrode draws along, over their distance: none meets another
-FAR = 1.0  # error of a slope, as a share of what is left to explain; with 0.3 places run away
-EXPLAINED = (
+MAX_SLOPE_ERROR = 1.0  # as a share of what is left to explain; with 0.3 places run away
+EXPLAINED_MISFIT = (
     1.5  # times its noise, left of a reference: of unloaded skins up to 0.9, of pressed ones 5
 )
 STEPS = 6  # of Gauss-Newton at most: electrodes 1.5 mm off take them all, ordinary ones three
@@ -83,7 +83,7 @@ def explains(
         return False
     ratio = voltages[usable] / sheet.bare_voltages[usable]
     left = (ratio / np.median(ratio) - 1) / noise[usable]
-    return bool(np.sqrt(np.mean(left**2)) < EXPLAINED)
+    return bool(np.sqrt(np.mean(left**2)) < EXPLAINED_MISFIT)
 
 
 class SheetEstimator:
@@ -143,7 +143,7 @@ class SheetEstimator:
             if left is None:
                 return None
             # Far from the minimum a slope is no surer than this: else places leap by centimetres.
-            error = np.hypot(noise, max(MODEL_ERROR, FAR * float(np.std(left[usable]))))
+            error = np.hypot(noise, max(MODEL_ERROR, MAX_SLOPE_ERROR * float(np.std(left[usable]))))
             precision = usable / error**2
             slopes = self._slopes(parameters, shape) / shape.voltages[:, None]
             slopes = np.append(slopes, np.ones((len(left), 1)), axis=1)

@@ -19,7 +19,7 @@ from tactomo_models.scans.frame_noise import FALSE_ALARM
 from tactomo_models.scans.reference import Reference
 from tactomo_models.sensor.pattern import Pairs
 
-LEAST_NOISE: Final = 0.1
+MIN_NOISE: Final = 0.1
 """Share of the tare's noise that a converter at work has at least: what is left by the mean of a
 hundred scans. A flicker of one count is told where the tare's noise is 8 counts or more."""
 EARLIER: Final = 16
@@ -71,7 +71,7 @@ class Repeats:
         with np.errstate(over="ignore"):
             changes = (scan[told] - earlier[:, told]) / noise[told]
             squares = np.einsum("nm,nm->n", changes, changes)
-        if (squares < 2 * LEAST_NOISE**2 * np.count_nonzero(told)).any():
+        if (squares < 2 * MIN_NOISE**2 * np.count_nonzero(told)).any():
             return Repeated((), np.ones(len(scan), bool))
         same = scan == earlier[-1]
         if np.count_nonzero(same) < self._sizes.min():

@@ -14,7 +14,7 @@ from typing import IO, Any
 import pytest
 from fixture_types import Run
 from processes import children_of, is_running
-from tactomo.cli.children import Family
+from tactomo.cli.children import ProcessGroup
 from tactomo.errors import TactomoError
 from waiting import PATIENCE_S, wait_until
 
@@ -172,14 +172,14 @@ def test_a_demo_prints_commands_that_a_shell_without_them_on_its_path_finds(
 
 @pytest.mark.slow
 def test_a_family_notices_whoever_ends_and_tells_its_last_words() -> None:
-    with Family() as family:
-        viewer = family.start("page", "viewer", "--viewer-port", "0", *NOWHERE)
+    with ProcessGroup() as group:
+        viewer = group.start("page", "viewer", "--viewer-port", "0", *NOWHERE)
         url = viewer.wait_ready()["url"]
         assert url.startswith("http://127.0.0.1:")
-        family.start("list", "models", "list").wait_done()  # has done its work: no reason to stop
+        group.start("list", "models", "list").wait_done()  # has done its work: no reason to stop
         taken = url.rstrip("/").rpartition(":")[2]
-        late = family.start("second", "viewer", "--viewer-port", taken, *NOWHERE)
-        assert family.wait_for_an_end() is late
+        late = group.start("second", "viewer", "--viewer-port", taken, *NOWHERE)
+        assert group.wait_for_an_end() is late
         assert viewer.is_running
         with pytest.raises(TactomoError, match=r"(?s)second stopped.*cannot listen"):
             late.wait_ready()
@@ -190,9 +190,9 @@ def test_a_family_notices_whoever_ends_and_tells_its_last_words() -> None:
 NOWHERE = ("-s", "skin", "--address", "ipc:///nowhere/at/all", "--control", "ipc:///nowhere/too")
 PARENT = """
 import sys
-from tactomo.cli.children import Family
-with Family() as family:
-    viewer = family.start("viewer", "viewer", "--viewer-port", "0", *sys.argv[1:])
+from tactomo.cli.children import ProcessGroup
+with ProcessGroup() as group:
+    viewer = group.start("viewer", "viewer", "--viewer-port", "0", *sys.argv[1:])
     viewer.wait_ready()
     print(viewer.pid, flush=True)
     sys.stdin.read()

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tactomo.acquisition.liveness import PATIENCE_S, REOPEN_MOST_S, REOPEN_S, DeviceState, Liveness
-from tactomo.timing import FEW, LONGEST_PERIOD_S
+from tactomo.timing import LATE_PERIODS, LONGEST_PERIOD_S
 
 
 @pytest.fixture
@@ -19,7 +19,7 @@ def device() -> Liveness:
 @pytest.mark.parametrize(
     ("packets", "scans", "state"),
     [
-        (0, 0, DeviceState.GARBAGE),
+        (0, 0, DeviceState.GARBLED),
         (1, 0, DeviceState.IDLE),
         (2, 1, DeviceState.RUNNING),
     ],
@@ -83,9 +83,9 @@ def test_a_slow_foreign_device_runs_and_one_that_stops_is_told_by_its_own_pace(
     device.opened(0.0)
     for number in range(1, 4):  # each frame comes at once; the first one is too late to be known of
         device.heard(number * period_s, 1, 1)
-    states = states_until(device, 3 * period_s, 3 * period_s + 0.9 * FEW * period_s)
+    states = states_until(device, 3 * period_s, 3 * period_s + 0.9 * LATE_PERIODS * period_s)
     assert states == {DeviceState.RUNNING}
-    assert device.judge(3 * period_s + 1.01 * FEW * period_s) is DeviceState.SILENT
+    assert device.judge(3 * period_s + 1.01 * LATE_PERIODS * period_s) is DeviceState.SILENT
 
 
 def test_until_its_pace_is_known_a_device_has_what_its_protocol_says() -> None:
@@ -131,7 +131,7 @@ def test_what_comes_after_silence_has_its_time_to_become_a_packet(since_s: float
     device.heard(since_s, 0, 0)
     assert device.judge(since_s + PATIENCE_S - 0.1) is DeviceState.SILENT
     device.heard(since_s + PATIENCE_S - 0.1, 0, 0)
-    assert device.judge(since_s + PATIENCE_S) is DeviceState.GARBAGE
+    assert device.judge(since_s + PATIENCE_S) is DeviceState.GARBLED
     device.heard(since_s + PATIENCE_S, 1, 1)
     assert device.judge(since_s + PATIENCE_S) is DeviceState.RUNNING
 

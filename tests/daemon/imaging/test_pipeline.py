@@ -11,7 +11,7 @@ import pytest
 from tactomo.imaging import pipeline as module
 from tactomo.imaging.pipeline import Pipeline
 from tactomo.recordings.replay import Playback, Replay
-from tactomo.scans import ChannelScan, Delivery, DualScan
+from tactomo.scans import ChannelScan, DualScan, PortRead
 from tactomo_protocol import Channel, ScanFlag
 from waiting import PATIENCE_S, wait_until
 
@@ -61,8 +61,8 @@ def scan(channel: Channel, counter: int, clock_ns: int, port: int = 0) -> Channe
     return ChannelScan(channel, counter, 100 * counter, ScanFlag(0), np.zeros(1), *times, 0, port)
 
 
-def dual(counter: int) -> Delivery:
-    return Delivery(0, counter, tuple(scan(channel, counter, counter) for channel in BOTH))
+def dual(counter: int) -> PortRead:
+    return PortRead(0, counter, tuple(scan(channel, counter, counter) for channel in BOTH))
 
 
 def test_what_overflows_is_counted_as_received_and_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,9 +91,9 @@ def test_an_unpaced_replay_waits_for_the_slower_port() -> None:
     for port, channel in enumerate(BOTH):  # one is seconds ahead of the other
         for counter in range(5):
             at_ns = counter * 10**9
-            pipeline.deliver(Delivery(port, at_ns, (scan(channel, counter, at_ns, port),)))
+            pipeline.deliver(PortRead(port, at_ns, (scan(channel, counter, at_ns, port),)))
     for port in (0, 1):
-        pipeline.deliver(Delivery(port, 0, (), has_ended=True))
+        pipeline.deliver(PortRead(port, 0, (), has_ended=True))
     assert pipeline.finished.wait(PATIENCE_S)
     pipeline.stop()
     assert frames.counters == list(range(5))

@@ -14,11 +14,11 @@ from fixture_types import Start
 from recorded_grasp import write_grasp
 from tactomo.config import load_config
 from tactomo.errors import ConfigError, PortError, RecordingError
-from tactomo.imaging import frame_marks
+from tactomo.imaging import frame_log
 from tactomo.recordings.recording import open_recording
-from tactomo.recordings.recording_writer import pack_mark, write_recording
-from tactomo.recordings.records import read_mark
-from tactomo.scans import Mark, ScanKey
+from tactomo.recordings.recording_writer import pack_frame, write_recording
+from tactomo.recordings.records import read_frame
+from tactomo.scans import FrameRecord, ScanKey
 from tactomo.service import daemon
 from tactomo.service.daemon import Daemon
 from tactomo_client import ControlError
@@ -74,7 +74,7 @@ def test_a_replay_leaves_out_what_the_live_run_dropped(
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "name"),
-    [(frame_marks, "mark_entry"), (daemon, "Entry")],
+    [(frame_log, "frame_entry"), (daemon, "Entry")],
     ids=["mark", "map"],
 )
 def test_a_frame_that_was_seen_is_in_the_recording(
@@ -122,8 +122,8 @@ def test_a_recording_whose_frames_were_made_by_the_hybrid_opens(tmp_path: Path) 
     """Earlier versions wrote that name for `auto` and what it did."""
     path = write_grasp(tmp_path / "old.mcap", range(3), lambda _: {"tier": "hybrid"})
     assert {frame.tier for frame in open_frames(path).frames()} == {"hybrid"}
-    mark = pack_mark(Mark((ScanKey(Channel.STRUCTURE, 7, 350_000),), "hybrid", None))
-    assert read_mark(mark).tier == "auto"
+    mark = pack_frame(FrameRecord((ScanKey(Channel.STRUCTURE, 7, 350_000),), "hybrid", None))
+    assert read_frame(mark).tier == "auto"
 
 
 def test_a_recording_knows_what_is_in_it(bench: Start, tmp_path: Path) -> None:

@@ -21,13 +21,13 @@ from tactomo.recordings.recording import Origin, open_recording
 from tactomo.recordings.recording_writer import (
     RecordingWriter,
     calibration_entry,
-    mark_entry,
+    frame_entry,
     port_entry,
     preamble_entry,
     reference_entry,
 )
 from tactomo.recordings.recovery import Recovery, recover
-from tactomo.scans import Mark, ScanKey
+from tactomo.scans import FrameRecord, ScanKey
 from tactomo_client.messages import array_from_wire
 from tactomo_client.recording_file import intact_chunks
 from tactomo_models import Reference
@@ -72,10 +72,10 @@ def write(path: Path) -> None:
         writer.add(port_entry(0, data, time_ns, time_ns))
         keys = tuple(ScanKey(p.channel, p.counter, p.device_us) for p in packets)
         calibrations = int(counter >= RECALIBRATED)
-        mark = Mark(
+        mark = FrameRecord(
             keys, "auto", None, reference_number=references, calibration_number=calibrations
         )
-        writer.add(mark_entry(mark, time_ns, time_ns))
+        writer.add(frame_entry(mark, time_ns, time_ns))
         if counter % A_CHUNK == A_CHUNK - 1:
             writer.flush()
     writer.close()

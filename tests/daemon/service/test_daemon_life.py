@@ -19,7 +19,7 @@ from tactomo.config import load_config
 from tactomo.errors import ConfigError, TactomoError
 from tactomo.imaging.pipeline import QUEUED_DELIVERIES
 from tactomo.recordings.recording import open_recording
-from tactomo.scans import Delivery
+from tactomo.scans import PortRead
 from tactomo.service.daemon import Daemon
 from waiting import PATIENCE_S, wait_until
 
@@ -175,7 +175,7 @@ def test_a_port_that_may_lose_nothing_does_not_wait_for_a_thread_that_died(bench
 
     def deliver() -> None:
         for _ in range(QUEUED_DELIVERIES + 1):
-            pipeline.deliver(Delivery(0, 0, ()))
+            pipeline.deliver(PortRead(0, 0, ()))
 
     port = threading.Thread(target=deliver, daemon=True)
     port.start()

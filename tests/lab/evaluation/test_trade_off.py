@@ -27,10 +27,10 @@ def point(p50_s: float, icc: float, snr_db: float = 40.0) -> Point:
 
 
 NOTHING = summarise([])
-FEW = st.sampled_from([0.1, 0.2, 0.3, 0.5])  # so that some are equal
+LATE_PERIODS = st.sampled_from([0.1, 0.2, 0.3, 0.5])  # so that some are equal
 
 
-@given(st.lists(st.builds(point, FEW, FEW | st.just(float("nan"))), max_size=12))
+@given(st.lists(st.builds(point, LATE_PERIODS, LATE_PERIODS | st.just(float("nan"))), max_size=12))
 def test_nothing_is_better_than_the_front_and_the_front_is_better_than_all_else(
     points: list[Point],
 ) -> None:

@@ -141,9 +141,9 @@ def _measure_twin(
     from tactomo_client import request, subscribe
     from tactomo_models import load_description
 
-    from tactomo.cli.children import new_family
+    from tactomo.cli.children import new_group
 
-    with tempfile.TemporaryDirectory(prefix="tactomo-") as folder, new_family() as family:
+    with tempfile.TemporaryDirectory(prefix="tactomo-") as folder, new_group() as group:
 
         def at(name: str) -> str:
             return f"ipc://{folder}/{name}"
@@ -151,13 +151,13 @@ def _measure_twin(
         size = load_description(results.description)
         spots = [_spot(size, place) for place in PLACES]
         described = ("--description", results.description)
-        family.start("models build", "models", "build", *described).wait_done()
-        skin = family.start(
+        group.start("models build", "models", "build", *described).wait_done()
+        skin = group.start(
             *("twin", "twin", *described, "--rate", str(rate)),
             *("--twin-control", at("twin"), "--announce"),
         ).wait_ready()
         lines = [word for path in skin["ports"] for word in ("--port", path)]
-        family.start(
+        group.start(
             *("daemon", "daemon", "--sensor", SENSOR, *described, *lines),
             *("--stream", at("stream"), "--control", at("control")),
         ).wait_ready()

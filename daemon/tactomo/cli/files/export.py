@@ -15,8 +15,8 @@ import typer
 from tactomo.cli.files.recorded_frames import (
     FromOption,
     Gaps,
-    Moment,
     RecordedFrames,
+    TimedFrame,
     ToOption,
     recorded_frames,
 )
@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 
 KINDS = {".mcap": "frames for Foxglove", ".csv": "contacts"}
 BAG, DATASET = "a ROS 2 bag", "a LeRobot dataset"
-Moments: TypeAlias = Iterator[Moment]
-Writer: TypeAlias = Callable[[RecordedFrames, Moments, Any], int]
+TimedFrames: TypeAlias = Iterator[TimedFrame]
+Writer: TypeAlias = Callable[[RecordedFrames, TimedFrames, Any], int]
 """Writes moments into an open file, or a folder that it makes; returns how many there were."""
 
 app = typer_app()
@@ -154,14 +154,14 @@ def _writer(kind: str) -> Writer:
         with needs("Foxglove", "pip install 'tactomo[foxglove]'"):
             from tactomo_foxglove import write_mcap
 
-        def write(frames: RecordedFrames, moments: Moments, file: IO[bytes]) -> int:
+        def write(frames: RecordedFrames, moments: TimedFrames, file: IO[bytes]) -> int:
             return write_mcap(_timed(frames, moments), file, frames.sensor, _about(frames))
 
         return write
     with needs("a ROS 2 bag", "pip install 'tactomo[ros2]'"):
         from tactomo_ros2.bag import write_bag
 
-    def write_folder(frames: RecordedFrames, moments: Moments, folder: Path) -> int:
+    def write_folder(frames: RecordedFrames, moments: TimedFrames, folder: Path) -> int:
         from tactomo_client.filled import filled
         from tactomo_client.schema import Mount
 
@@ -187,7 +187,7 @@ def _dataset_writer(
     log = None if robot is None else read_robot_log(robot)
     need_lerobot()
 
-    def write(frames: RecordedFrames, moments: Moments, folder: Path) -> int:
+    def write(frames: RecordedFrames, moments: TimedFrames, folder: Path) -> int:
         count, lines = write_dataset(moments, folder, frames.sensor, gaps, log, fps, task)
         told.extend(lines)
         return count
@@ -233,7 +233,9 @@ def _write_folder(output: Path, write: Callable[[Path], int]) -> int:
     return count
 
 
-def _timed(frames: RecordedFrames, moments: Moments) -> Iterator[tuple[int, Frame, float | None]]:
+def _timed(
+    frames: RecordedFrames, moments: TimedFrames
+) -> Iterator[tuple[int, Frame, float | None]]:
     """Yield the moments with their times in nanoseconds since 1970."""
     for time_s, frame, age_s in moments:
         yield frames.start_ns + round(time_s * 1e9), frame, age_s
@@ -257,7 +259,7 @@ ARRAY_COLUMNS: Final = {"magnitude_sigma": "contact_sigma", "frame": "contact_mo
 """Columns whose array in the .npz of `tactomo reconstruct` is not named `contact_` and theirs."""
 
 
-def write_contacts(moments: Iterable[Moment], output: IO[bytes]) -> int:
+def write_contacts(moments: Iterable[TimedFrame], output: IO[bytes]) -> int:
     """Write the contacts of frames; return how many frames there were."""
     from tactomo_client import Contact
     from tactomo_client.schema import table_row

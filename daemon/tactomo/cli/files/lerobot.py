@@ -22,7 +22,7 @@ import numpy as np
 from tactomo_models.arrays import FloatArray
 from tactomo_models.foreign_file import open_regular
 
-from tactomo.cli.files.recorded_frames import Gaps, Moment
+from tactomo.cli.files.recorded_frames import Gaps, TimedFrame
 from tactomo.errors import TactomoError, needs
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 CLOCKS: Final = ("monotonic_s", "realtime_s")
 ACTION: Final = "action."
 EPISODE: Final = "episode"
-MOST_LINE: Final = 1 << 20  # characters
+MAX_LINE: Final = 1 << 20  # characters
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def read_robot_log(path: Path) -> RobotLog:
     numbers = array("d")
     try:
         with open_regular(path) as binary, io.TextIOWrapper(binary, "utf-8", newline="") as file:
-            lines = csv.reader(iter(lambda: file.readline(MOST_LINE), ""), strict=True)
+            lines = csv.reader(iter(lambda: file.readline(MAX_LINE), ""), strict=True)
             names = [name.strip() for name in next(lines, [])]
             for number, line in enumerate(lines, 2):
                 numbers.extend(_numbers(path, number, names, line))
@@ -126,23 +126,23 @@ class Step(NamedTuple):
     """A time, the frame that the dataset has there, and how old that is; 0 where there is none."""
 
     time_s: float
-    moment: Moment | None
+    moment: TimedFrame | None
     age_s: float
 
 
 class Alignment:
     """Gives each time its frame, and counts what does not fit."""
 
-    def __init__(self, acquired_s: Callable[[Moment], float]) -> None:
+    def __init__(self, acquired_s: Callable[[TimedFrame], float]) -> None:
         self._acquired_s = acquired_s
         self._without = self._repeated = self._passed_over = 0
 
     def steps(
-        self, moments: Iterator[Moment], times_s: Iterable[float], *, is_endless: bool
+        self, moments: Iterator[TimedFrame], times_s: Iterable[float], *, is_endless: bool
     ) -> Iterator[Step]:
         """Yield a step for each time; of endless times, for those within the recording."""
-        newest: Moment | None = None
-        shown: Moment | None = None
+        newest: TimedFrame | None = None
+        shown: TimedFrame | None = None
         coming = next(moments, None)
         for time_s in times_s:
             while coming is not None and self.published_s(coming) <= time_s + RESOLUTION_S:
@@ -159,7 +159,7 @@ class Alignment:
             shown = newest
             yield Step(time_s, newest, age_s)
 
-    def published_s(self, moment: Moment) -> float:
+    def published_s(self, moment: TimedFrame) -> float:
         """Return when a frame was there for others; made frames, when it was acquired."""
         return self._acquired_s(moment) + (moment.age_s or 0.0)
 
@@ -183,7 +183,7 @@ def need_lerobot() -> None:
 
 
 def write_dataset(
-    moments: Iterator[Moment],  # the frames, in the order of their times
+    moments: Iterator[TimedFrame],  # the frames, in the order of their times
     folder: Path,  # the dataset, which must not be there yet
     sensor: str,  # the sensor's name
     gaps: Gaps,  # watches `moments`
@@ -241,7 +241,7 @@ def write_dataset(
     return count, lines
 
 
-def _up_to_first_map(moments: Iterator[Moment]) -> Iterator[Moment]:
+def _up_to_first_map(moments: Iterator[TimedFrame]) -> Iterator[TimedFrame]:
     for moment in moments:
         yield moment
         if _image(moment) is not None:
@@ -252,12 +252,12 @@ def _up_to_first_map(moments: Iterator[Moment]) -> Iterator[Moment]:
     )
 
 
-def _image(moment: Moment) -> Any:
+def _image(moment: TimedFrame) -> Any:
     images = (moment.frame.pressure_kpa, moment.frame.map, moment.frame.structure)
     return next((image for image in images if image is not None), None)
 
 
-def _shape(moment: Moment) -> tuple[int, int]:
+def _shape(moment: TimedFrame) -> tuple[int, int]:
     rows, columns = _image(moment).shape
     return rows, columns
 
@@ -270,10 +270,10 @@ def _rate(log: RobotLog | None) -> int:
     return round(1 / log.period_s)
 
 
-def _clock(log: RobotLog | None, gaps: Gaps) -> Callable[[Moment], float]:
+def _clock(log: RobotLog | None, gaps: Gaps) -> Callable[[TimedFrame], float]:
     """Return how to read from a moment when it was acquired, s, on the clock that rows have."""
 
-    def by_clock(moment: Moment) -> float:
+    def by_clock(moment: TimedFrame) -> float:
         assert log is not None
         if log.clock == "monotonic_s":
             if moment.age_s is None:

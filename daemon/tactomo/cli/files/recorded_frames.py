@@ -35,7 +35,7 @@ ToOption = Annotated[
 ]
 
 
-class Moment(NamedTuple):
+class TimedFrame(NamedTuple):
     """A frame and its time in the recording."""
 
     time_s: float  # when it was acquired, seconds from the recording's beginning
@@ -58,20 +58,20 @@ class RecordedFrames:
     _given: Recording
     _remade: Sequence[Recording]  # of each file, if it had to be made; otherwise none
 
-    def moments(self, kind: Literal["map", "contacts"] = "map") -> Iterator[Moment]:
+    def moments(self, kind: Literal["map", "contacts"] = "map") -> Iterator[TimedFrame]:
         """Yield the frames in the order of their times, one at a time."""
         every = self._made_moments(kind) if self._remade else self._kept_moments(kind)
         # A frame may have been acquired just before the recording's first message.
         start_s = self.start_s or -float("inf")
         return (moment for moment in every if start_s <= moment.time_s < self.end_s)
 
-    def _kept_moments(self, kind: Literal["map", "contacts"]) -> Iterator[Moment]:
+    def _kept_moments(self, kind: Literal["map", "contacts"]) -> Iterator[TimedFrame]:
         clock = _Clock(self.start_ns)
         window = {"start_s": max(0.0, self.start_s - MARGIN_S), "end_s": self.end_s + MARGIN_S}
         for frame in self._given.frames(kind, **window):
-            yield Moment(clock.time_s(frame), frame, frame.age_s)
+            yield TimedFrame(clock.time_s(frame), frame, frame.age_s)
 
-    def _made_moments(self, kind: Literal["map", "contacts"]) -> Iterator[Moment]:
+    def _made_moments(self, kind: Literal["map", "contacts"]) -> Iterator[TimedFrame]:
         """Yield frames that were made of a replay, which knows its own times only."""
         for file, made in zip(self._given.files, self._remade, strict=True):
             arrivals = _arrivals(file)
@@ -85,9 +85,9 @@ class RecordedFrames:
                 at_that_time = replace(
                     frame, acquired_realtime_ns=clock_ns, acquired_monotonic_ns=clock_ns
                 )
-                yield Moment((clock_ns - self.start_ns) * 1e-9, at_that_time, None)
+                yield TimedFrame((clock_ns - self.start_ns) * 1e-9, at_that_time, None)
 
-    def with_progress(self, moments: Iterator[Moment], doing: str) -> Iterator[Moment]:
+    def with_progress(self, moments: Iterator[TimedFrame], doing: str) -> Iterator[TimedFrame]:
         """Yield the moments, with a bar on standard error that shows how far this has come."""
         length_s = min(self.end_s, self._given.duration_s) - self.start_s
         with progress_bar(doing) as show:
@@ -248,9 +248,9 @@ class Gaps:
         self._first_s: dict[str, float] = {}
         self._flags: Counter[str] = Counter()
         self.first_step_s = 0.0  # by how much the wall clock was set first, s; 0 where it was not
-        self._last: Moment | None = None
+        self._last: TimedFrame | None = None
 
-    def watch(self, moments: Iterator[Moment]) -> Iterator[Moment]:
+    def watch(self, moments: Iterator[TimedFrame]) -> Iterator[TimedFrame]:
         """Yield the moments as they are."""
         for moment in moments:
             self._add(moment)
@@ -276,12 +276,12 @@ class Gaps:
             if self._counts[what]
         ]
 
-    def _count(self, what: str, moment: Moment, count: int = 1) -> None:
+    def _count(self, what: str, moment: TimedFrame, count: int = 1) -> None:
         if count > 0:
             self._counts[what] += count
             self._first_s.setdefault(what, moment.time_s)
 
-    def _add(self, moment: Moment) -> None:
+    def _add(self, moment: TimedFrame) -> None:
         frame, last = moment.frame, self._last
         lost = missing(last, moment, "sequence")
         self._count("lost", moment, lost)
@@ -301,7 +301,7 @@ class Gaps:
             self._count("set", moment)
 
 
-def missing(last: Moment | None, moment: Moment, counter: str) -> int:
+def missing(last: TimedFrame | None, moment: TimedFrame, counter: str) -> int:
     """Return how many a frame's counter has left out since the frame before of the same run."""
     if last is None or last.frame.session != moment.frame.session:
         return 0
@@ -309,5 +309,5 @@ def missing(last: Moment | None, moment: Moment, counter: str) -> int:
     return int(max(0, step - 1))
 
 
-def _wall_less_steady_s(moment: Moment) -> float:
+def _wall_less_steady_s(moment: TimedFrame) -> float:
     return (moment.frame.acquired_realtime_ns - moment.frame.acquired_monotonic_ns) * 1e-9

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from tactomo.cli.files.recorded_frames import Moment, RecordedFrames, missing
+from tactomo.cli.files.recorded_frames import RecordedFrames, TimedFrame, missing
 
 if TYPE_CHECKING:
     from tactomo_client import Contact
@@ -48,7 +48,7 @@ def read_course(frames: RecordedFrames) -> Course:
     """Read the frames of a recording without their images."""
     course = Course(frames.sensor, frames.start_ns)
     sessions: dict[str, str] = {}
-    last: Moment | None = None
+    last: TimedFrame | None = None
     for moment in frames.with_progress(frames.moments("contacts"), "reading"):
         frame = moment.frame
         run = sessions.setdefault(frame.session, "'" * len(sessions))  # ids begin anew in each
@@ -69,10 +69,10 @@ def read_course(frames: RecordedFrames) -> Course:
     return course
 
 
-def read_maps(frames: RecordedFrames, course: Course) -> list[Moment]:
+def read_maps(frames: RecordedFrames, course: Course) -> list[TimedFrame]:
     """Read the frames of the telling moments, with their images."""
     wanted = [course.times_s[i] for i in telling_moments(course.times_s, course.pressed)]
-    found: list[Moment] = []
+    found: list[TimedFrame] = []
     for moment in frames.with_progress(frames.moments(), "reading maps"):
         if len(found) < len(wanted) and moment.time_s >= wanted[len(found)]:
             found.append(moment)

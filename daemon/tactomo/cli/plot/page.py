@@ -14,7 +14,7 @@ from matplotlib.ticker import LogLocator
 from tactomo_client import Contact, Frame
 from tactomo_client.appearance import COLOURS, map_pixels, shown_image
 
-from tactomo.cli.files.recorded_frames import Moment
+from tactomo.cli.files.recorded_frames import TimedFrame
 from tactomo.cli.plot.course import Course, Track
 from tactomo.cli.plot.electrodes import draw_electrodes, outline_path
 from tactomo.imaging.frames import description_fields
@@ -36,7 +36,7 @@ LETTERS: Final = "abcdefghijkl"
 
 def draw_page(
     course: Course,
-    maps: Sequence[Moment],
+    maps: Sequence[TimedFrame],
     description: SensorDescription | None,
     title: str,
 ) -> Figure:
@@ -203,7 +203,7 @@ def _draw_rows(
     figure: Any,
     rows: Sequence[str],
     course: Course,
-    maps: Sequence[Moment],
+    maps: Sequence[TimedFrame],
     colours: dict[str, Any],
 ) -> None:
     heights = [HEIGHTS_IN[row] for row in rows]

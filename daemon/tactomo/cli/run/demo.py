@@ -22,7 +22,7 @@ from tactomo.endpoint import free_addresses
 from tactomo.running import running
 
 if TYPE_CHECKING:
-    from tactomo.cli.children import Family
+    from tactomo.cli.children import ProcessGroup
 
 TARE_PATIENCE_S = 10.0
 
@@ -66,7 +66,7 @@ def demo(
     writes recordings into this folder. The page presses the skin by itself until somebody presses
     it.
     """
-    from tactomo.cli.children import new_family
+    from tactomo.cli.children import new_group
 
     stream, control, twin_control = free_of(
         (stream, options.DEFAULT_STREAM),
@@ -85,24 +85,24 @@ def demo(
         *_optional("--method", method),
         *("--set", f"recording.folder={json.dumps(str(Path.cwd()))}"),
     ]
-    with tempfile.TemporaryDirectory(prefix="tactomo-") as folder, new_family() as family:
+    with tempfile.TemporaryDirectory(prefix="tactomo-") as folder, new_group() as group:
         # On a first start the daemon's models take as long to build as the twin's: do both at once.
-        builder = family.start("models build", "models", "build", "--description", description)
-        skin = family.start("twin", "twin", "--link", folder, "--announce", *twin_options)
+        builder = group.start("models build", "models", "build", "--description", description)
+        skin = group.start("twin", "twin", "--link", folder, "--announce", *twin_options)
         asked = {"sensor": sensor, "stream": stream, "control": control, "twin": twin_control}
         page = None
         if not any(address.endswith((":0", ":*")) for address in (stream, control, twin_control)):
             # The page waits for the daemon by itself: it need not wait here.
-            page = _open_page(family, asked, viewer_port, not no_browser, presses_itself)
+            page = _open_page(group, asked, viewer_port, not no_browser, presses_itself)
             print(f"starting; the page is {page}", file=sys.stderr)
         simulated = skin.wait_ready()
         builder.wait_done()
         lines = [word for path in simulated["ports"] for word in ("--port", path)]
-        daemon = family.start("daemon", "daemon", *daemon_options, *lines)
+        daemon = group.start("daemon", "daemon", *daemon_options, *lines)
         addresses = {**_served(daemon.wait_ready()), "twin": simulated["control"]}
         _wait_tared(addresses["control"])
-        page = page or _open_page(family, addresses, viewer_port, not no_browser, presses_itself)
-        _stay(family, {**addresses, "viewer": page}, announce)
+        page = page or _open_page(group, addresses, viewer_port, not no_browser, presses_itself)
+        _stay(group, {**addresses, "viewer": page}, announce)
 
 
 def free_of(*asked: tuple[str | None, str]) -> list[str]:
@@ -136,16 +136,16 @@ def show_replay(
     more: list[str],
 ) -> None:
     """Play a recording through a daemon and show it in the viewer until Ctrl-C."""
-    from tactomo.cli.children import new_family
+    from tactomo.cli.children import new_group
 
-    with new_family() as family:
-        daemon = family.start(
+    with new_group() as group:
+        daemon = group.start(
             *("replay", "replay", str(recording), "--speed", speed, "--sensor", sensor),
             *("--stream", stream, "--control", control, "--stay", *more),
         )
         addresses = _served(daemon.wait_ready())
-        page = _open_page(family, addresses, viewer_port, browser=True)
-        _stay(family, {**addresses, "viewer": page}, announce=False)
+        page = _open_page(group, addresses, viewer_port, browser=True)
+        _stay(group, {**addresses, "viewer": page}, announce=False)
 
 
 def _served(ready: Mapping[str, Any]) -> dict[str, Any]:
@@ -154,14 +154,14 @@ def _served(ready: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _open_page(
-    family: Family,
+    group: ProcessGroup,
     addresses: Mapping[str, Any],
     port: int | None,
     browser: bool,
     presses_itself: bool = False,
 ) -> str:
     """Start the viewer, show its page where there is a desktop, and return the page's URL."""
-    viewer = family.start(
+    viewer = group.start(
         *("viewer", "viewer", "--sensor", addresses["sensor"]),
         *_optional("--viewer-port", port),
         *(["--press-itself"] if presses_itself else []),
@@ -174,7 +174,7 @@ def _open_page(
     return page
 
 
-def _stay(family: Family, addresses: Mapping[str, Any], announce: bool) -> None:
+def _stay(group: ProcessGroup, addresses: Mapping[str, Any], announce: bool) -> None:
     """Tell the user where everything is, and stay until something ends."""
     from tactomo.cli.children import print_ready
 
@@ -183,7 +183,7 @@ def _stay(family: Family, addresses: Mapping[str, Any], announce: bool) -> None:
     else:
         _print_addresses(addresses)
     try:
-        raise family.wait_for_an_end().failure()
+        raise group.wait_for_an_end().failure()
     except KeyboardInterrupt:
         print("stopping", file=sys.stderr)
 

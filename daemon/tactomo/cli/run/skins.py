@@ -45,7 +45,7 @@ log = structlog.get_logger()
 class _Process:
     name: str
     run: Callable[[], int]
-    ear: socket.socket
+    notify_socket: socket.socket
     pid = 0
     status = "starting"
     is_ready = has_been_ready = is_aborted = is_done = False
@@ -53,7 +53,7 @@ class _Process:
 
     def hear(self) -> None:
         """Take note of what the daemon has notified."""
-        for line in self.ear.recv(4096).decode("utf-8", "replace").splitlines():
+        for line in self.notify_socket.recv(4096).decode("utf-8", "replace").splitlines():
             key, _, value = line.partition("=")
             if key == "READY":
                 self.is_ready = self.has_been_ready = True
@@ -82,8 +82,8 @@ class SkinProcesses:
         at_end(self._on_signal)
         with contextlib.ExitStack() as undo:
             folder = Path(undo.enter_context(tempfile.TemporaryDirectory(prefix="tactomo-")))
-            leash, self._leash_end = os.pipe()
-            self._leash = leash
+            parent_pipe, self._parent_end = os.pipe()
+            self._parent_pipe = parent_pipe
             processes = [self._daemon(skin, folder, undo) for skin in self._skins]
             gc.collect()
             gc.freeze()  # a collection in a child would copy every page that it looks through
@@ -94,10 +94,10 @@ class SkinProcesses:
 
     def _watch(self, processes: list[_Process]) -> int:
         is_ready, told_s = False, 0.0
-        ears = {process.ear: process for process in processes}
+        sockets = {process.notify_socket: process for process in processes}
         while not self._is_stopping:
-            for ear in select.select(list(ears), [], [], TURN_S)[0]:
-                ears[ear].hear()
+            for notify_socket in select.select(list(sockets), [], [], TURN_S)[0]:
+                sockets[notify_socket].hear()
             for process in processes:
                 self._look_after(process)
             if all(each.is_done for each in processes):
@@ -153,10 +153,10 @@ class SkinProcesses:
             for number in (*ASKED, *AS_WELL):
                 if signal.getsignal(number) is not signal.SIG_IGN:
                     signal.signal(number, signal.SIG_DFL)
-            os.close(self._leash_end)
-            stop_at_end_of(self._leash)
+            os.close(self._parent_end)
+            stop_at_end_of(self._parent_pipe)
             os.environ.pop("WATCHDOG_PID", None)
-            os.environ["NOTIFY_SOCKET"] = process.ear.getsockname()
+            os.environ["NOTIFY_SOCKET"] = process.notify_socket.getsockname()
             os.environ["WATCHDOG_USEC"] = str(round(WATCHDOG_S * 1e6))
             status = process.run()
         except Exception as error:
@@ -169,14 +169,14 @@ class SkinProcesses:
             os._exit(status)
 
     def _daemon(self, skin: DaemonConfig, folder: Path, undo: contextlib.ExitStack) -> _Process:
-        ear = undo.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
-        ear.bind(str(folder / skin.name))
+        notify_socket = undo.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+        notify_socket.bind(str(folder / skin.name))
 
         def run() -> int:
             configure_logging(skin.log_level, skin.log_format, skin.name)
             return Daemon(skin, artifact=self._artifacts[skin.description]).run()
 
-        return _Process(skin.name, run, ear)
+        return _Process(skin.name, run, notify_socket)
 
     def _on_signal(self, _: int, __: FrameType | None) -> None:
         self._is_stopping = True

@@ -1,6 +1,6 @@
-"""The door to foxglove-sdk's server, which lets in whoever connects: no web page but Foxglove's.
+"""The proxy to foxglove-sdk's server, which lets in whoever connects: no web page but Foxglove's.
 
-A browser connects for any page to any port, and says in `Origin` whose page it is. So the door
+A browser connects for any page to any port, and says in `Origin` whose page it is. So the proxy
 reads the head of each request before it passes on a byte. The server behind it listens where no
 page finds it, at one of this computer's 16 million loopback addresses.
 """
@@ -31,7 +31,7 @@ def hidden_address() -> str:
     return ".".join(map(str, (127, *(1 + secrets.randbelow(254) for _ in range(3)))))
 
 
-class Door:
+class OriginProxy:
     """Listens in the server's stead, from a thread of its own; `open` it to a server, `close` it.
 
     Raises OSError where the address cannot be listened on.
@@ -45,7 +45,7 @@ class Door:
         self._origins = frozenset(origins)
         self._behind = ("", 0)
         self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._run, name="foxglove-door")
+        self._thread = threading.Thread(target=self._run, name="foxglove-proxy")
 
     def open(self, host: str, port: int) -> None:
         """Let clients in to the server that listens there."""

@@ -18,10 +18,10 @@ from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording_writer import (
     ActiveRecording,
     calibration_entry,
-    mark_entry,
+    frame_entry,
     reference_entry,
 )
-from tactomo.scans import DualScan, Mark, Timing
+from tactomo.scans import DualScan, FrameRecord, Timing
 from tactomo.timing import wall_clock_ns
 
 REPEAT_S: Final = 60.0
@@ -38,7 +38,7 @@ class InForce:
     calibration: str  # the text of the pressure calibration; empty for the description's curve
 
 
-class FrameMarks:
+class FrameLog:
     """Marks frames in the recording that runs."""
 
     def __init__(self, recorder: Recorder) -> None:
@@ -70,7 +70,7 @@ class FrameMarks:
         if recording is None or dual.recording != recording.number:
             return
         self._tell(recording, in_force)
-        done = Mark(
+        done = FrameRecord(
             tuple(scan.key for scan in dual.scans),
             in_force.method,
             in_force.budget_ms,
@@ -78,7 +78,7 @@ class FrameMarks:
             reference_number=recording.references or None,
             calibration_number=recording.calibrations,
         )
-        recording.add(mark_entry(done, time.monotonic_ns(), wall_clock_ns()))
+        recording.add(frame_entry(done, time.monotonic_ns(), wall_clock_ns()))
 
     def _tell(self, recording: ActiveRecording, in_force: InForce) -> None:
         """Say reference and calibration, where they are new to the recording, or now and then."""
