@@ -1,4 +1,4 @@
-"""What passes from the ports to imaging, into recordings and back: scans, dual scans, frame records.
+"""What passes from the ports to imaging, into recordings and back: scans, and records of frames.
 
 Plain values without the serial stack, so that whatever is pure may import them.
 """
