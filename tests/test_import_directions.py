@@ -56,7 +56,7 @@ ORDER = {
             "inner_loop",
         ),
         *("sensor", "imported", "physics", "scans", "scene", "methods", "simulation"),
-        *("calibration", "health", "reconstruct", "batch", "drift"),
+        *("calibration", "health", "frames", "reconstruct", "batch", "drift"),
         *("commissioning", "simulators"),
     ),
     "tactomo": (

@@ -20,29 +20,25 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.calibration.taught_skin import TaughtSkin
-from tactomo_models.errors import DataError, ModelError
-from tactomo_models.methods.magnitudes import BAD_MISFIT
+from tactomo_models.errors import ModelError
+from tactomo_models.frames import FrameMaker
 from tactomo_models.methods.method import Estimate, Method, Skin, UnsolvableError
 from tactomo_models.methods.registry import check_method, make_method
 from tactomo_models.physics.artifact import Artifact
 from tactomo_models.scans.changes import Changes
-from tactomo_models.scans.companion_forces import CompanionForce, CompanionReading
+from tactomo_models.scans.companion_forces import CompanionReading
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scans.repeats import Repeats
 from tactomo_models.scans.stillness import are_still
 from tactomo_models.scans.tare import Tare
-from tactomo_models.scene.areas import Areas
-from tactomo_models.scene.contacts import contacts_of, mounted, pressure_map, total_force
-from tactomo_models.scene.pressure import PressureCurve, PressureRange, described_curve
+from tactomo_models.scene.pressure import PressureCurve, described_curve
 from tactomo_models.scene.reconstruction import Reconstruction
-from tactomo_models.scene.tracking import ContactTracker
 from tactomo_models.sensor.description import SensorDescription
 
 DEFAULT_BUDGET_S: Final = 0.05
 FALLBACK: Final = "tikhonov"
-STEADY: Final = 5.0  # standard uncertainties that a steady press's magnitude changes by, at most
 
 
 class Reconstructor:
@@ -94,8 +90,7 @@ class Reconstructor:
         self._failures: dict[str, str] = {}  # of methods prepared since the tare; empty if good
         self._previous: Estimate | None = None
         self._still: _Still | None = None  # since when the sheets have not moved
-        self._tracker = ContactTracker()
-        self._ranges: dict[int, tuple[PressureRange, float]] = {}  # and magnitude, of each identity
+        self._frames = FrameMaker(description, skin.areas)
         self._name = method if isinstance(method, str) else type(method).__name__
         if isinstance(method, str):
             check_method(method, description)
@@ -176,7 +171,7 @@ class Reconstructor:
 
     def reset(self) -> None:
         """Forget the warm start, earlier scans, and which contacts were which."""
-        self._tracker.clear()
+        self._frames.forget()
         self._repeats.forget()
         self.forget_shape()
 
@@ -263,15 +258,14 @@ class Reconstructor:
     def solve(self, measurement: Measurement) -> Reconstruction:
         """The second half of `reconstruct`: what follows from a measurement."""
         if not measurement.changes and measurement.flags & Flag.NO_REFERENCE:
-            return self._nothing(measurement, "no reference yet")
+            return self._frames.nothing(measurement, "no reference yet")
         if not measurement.changes:
             flagged = replace(measurement, flags=measurement.flags | Flag.NO_USABLE_SCAN)
-            return self._nothing(flagged, "no usable scan")
+            return self._frames.nothing(flagged, "no usable scan")
         if measurement.is_quiet:
             lasting = None if self._previous is None else self._previous.lasting
             self._previous = None if lasting is None else Estimate(carried=lasting, lasting=lasting)
-            self._tracker.update(np.zeros((0, 2)), np.zeros(0))
-            return self._nothing(measurement, "no change above the noise")
+            return self._frames.quiet(measurement)
         previous, self._previous = self._previous, None
         try:
             return self._by_method(self._name, measurement, previous)
@@ -299,7 +293,7 @@ class Reconstructor:
         try:
             with measurement.timed(name):
                 estimate = method.solve(measurement, previous, budget_s)
-            self._check(estimate)
+            self._frames.check(estimate)
             frame = self._frame(estimate, measurement)
         except UnsolvableError:
             raise
@@ -307,6 +301,9 @@ class Reconstructor:
             raise _MethodFailedError(f"method {name} failed: {_in_words(error)}") from error
         self._previous = estimate
         return frame
+
+    def _frame(self, estimate: Estimate, measurement: Measurement) -> Reconstruction:
+        return self._frames.frame(estimate, measurement, self._name, self.curve, self.taught)
 
     def _prepared(self, name: str) -> Method:
         """The method of a name, prepared with the skin as it was at the tare."""
@@ -322,156 +319,6 @@ class Reconstructor:
                     raise
                 self._failures[name] = f"method {name} failed to prepare: {_in_words(error)}"
         return method
-
-    def _check(self, estimate: Estimate) -> None:
-        """Raise `DataError` for an estimate that cannot be shown."""
-        if not isinstance(estimate, Estimate):
-            raise DataError(f"returned {type(estimate).__name__}, not Estimate")
-        shape = (self.description.map.nodes_y, self.description.map.nodes_x)
-        images = {"map": estimate.map, "structure": estimate.structure}
-        if estimate.areas is None and all(image is None for image in images.values()):
-            raise DataError("returned neither map nor structure")
-        for what, image in images.items():
-            if image is None:
-                continue
-            if not isinstance(image, np.ndarray) or image.dtype.kind != "f":
-                raise DataError(f"{what} is no array of floating-point numbers")
-            if image.shape != shape:
-                raise DataError(f"{what} has shape {image.shape}, not {shape}")
-            if not (np.abs(image) < np.finfo(np.float32).max).all():
-                raise DataError(f"{what} holds values that are not finite")
-        if estimate.areas is None and not (
-            estimate.magnitudes is None and np.ndim(estimate.magnitude_sigmas) == 0
-        ):
-            raise DataError("returned magnitudes without their areas")
-        words = (estimate.made_by, estimate.reason)
-        if not all(isinstance(each, str) for each in words):
-            raise DataError("made_by and reason are not both text")
-        numbers = (estimate.misfit, estimate.confidence)
-        if not all(isinstance(each, (float, int, np.floating)) for each in numbers):
-            raise DataError("misfit and confidence are not both numbers")
-
-    def _nothing(self, measurement: Measurement, reason: str) -> Reconstruction:
-        """A frame in which nothing presses, as far as the measurement can tell."""
-        changes, flags, misfit = measurement.changes, measurement.flags, float("nan")
-        if changes:
-            # The measure that told quiet; where it is blunt, the changes over noise alone.
-            misfit = max(each.signal for each in changes.values())
-            if flags & (Flag.NOISE_HIGH | Flag.STRUCTURE_MISSING):
-                misfit = max(each.misfit for each in changes.values())
-                if misfit > BAD_MISFIT:
-                    flags |= Flag.MISFIT_HIGH
-            tells = Channel.STRUCTURE if Channel.STRUCTURE in changes else Channel.MAGNITUDE
-            if changes[tells].hides:
-                flags |= Flag.NOISE_HIGH
-        blank = self.description.shown(
-            np.zeros((self.description.map.nodes_y, self.description.map.nodes_x))
-        )
-        magnitude = blank if Channel.MAGNITUDE in changes else None
-        return Reconstruction(
-            map=magnitude,
-            pressure_kpa=magnitude,
-            structure=blank if Channel.STRUCTURE in changes else None,
-            contacts=(),
-            tier="quiet",
-            reason="; ".join([reason, *measurement.faults]),
-            misfit=misfit,
-            flags=flags,
-            stage_s=measurement.stage_s,
-            force_n=0.0 if changes else float("nan"),
-            companions=_judged(measurement, {}),
-        )
-
-    def _frame(self, estimate: Estimate, measurement: Measurement) -> Reconstruction:
-        """The frame that an estimate makes, with its contacts and pressures."""
-        has_magnitude = Channel.MAGNITUDE in measurement.changes
-        with measurement.timed("contacts"):
-            areas, size, sigma = self._areas_of(estimate)
-            ids = self._tracker.update(areas.centres_m, areas.areas_m2)
-            account = estimate.account
-            field = account.contacts if account else None
-            felt, noise = (size, sigma) if field is None else (field.felt, field.felt_sigma)
-            # A press that is clearly another one than a frame ago has no range to keep.
-            last = {
-                known: self._ranges[known][0]
-                for known, now, by_chance in zip(ids, felt, STEADY * noise, strict=True)
-                if known in self._ranges and abs(now - self._ranges[known][1]) <= by_chance
-            }
-            contacts = contacts_of(areas, ids, size, sigma, self.curve, last=last, field=field)
-            seen = {
-                contact.id: (contact.pressure_range, float(now))
-                for contact, now in zip(contacts, felt, strict=True)
-            }
-            kept = self._ranges | seen
-            self._ranges = {known: kept[known] for known in self._tracker.ids if known in kept}
-        tier, flags = estimate.made_by or self._name, measurement.flags | estimate.flags
-        if not contacts and not estimate.has_drifted:
-            flags |= Flag.MISFIT_HIGH  # something has changed, and nothing explains it
-        if contacts and any(each.is_factor for each in measurement.changes.values()):
-            flags |= Flag.REFERENCE_MISMATCH  # one gain explains what contacts do
-        if self.taught is not None and len(contacts) == 1:
-            with measurement.timed("taught"):
-                contacts = (self.taught.corrected(contacts[0], measurement, tier),)
-            if not contacts[0].taught:
-                flags |= Flag.UNTAUGHT
-        if self.description.mount is not None:
-            contacts = mounted(contacts, self.description.mount)
-        force_n, force_sigma_n = total_force(contacts, self.curve, field)
-        companions = _judged(measurement, estimate.companions)
-        if contacts and np.isnan(force_sigma_n):
-            # The sheets tell a least force, or none; what feels all of the sheet tells all of it.
-            whole = [
-                (one.sigma_n, one.force_n)
-                for name, one in companions.items()
-                if one.state == "fitted" and self.description.companion[name].region_m is None
-            ]
-            force_sigma_n, force_n = min(whole, default=(force_sigma_n, force_n))
-        pressure = None
-        if estimate.tells_pressure and has_magnitude:
-            pressure = pressure_map(areas, contacts, account.pressure_kpa if account else None)
-        shown = self.description.shown
-        return Reconstruction(
-            map=shown(estimate.map),
-            pressure_kpa=shown(pressure),
-            structure=shown(estimate.structure),
-            contacts=contacts,
-            tier=tier,
-            reason="; ".join([estimate.reason, *measurement.faults]),
-            misfit=estimate.misfit,
-            flags=flags,
-            stage_s=measurement.stage_s,
-            confidence=estimate.confidence,
-            force_n=force_n,
-            force_sigma_n=force_sigma_n,
-            companions=companions,
-        )
-
-    def _areas_of(self, estimate: Estimate) -> tuple[Areas, FloatArray, FloatArray]:
-        """The pressed areas of an estimate, their magnitudes (K,) and uncertainties (K,)."""
-        areas, finder = estimate.areas, self._skin.areas
-        if areas is None:
-            if estimate.structure is not None:
-                pressed = np.abs(estimate.structure)
-            else:
-                assert estimate.map is not None
-                pressed = estimate.map / max(float(estimate.map.max()), 1e-12)
-            areas = finder.find(pressed, finder.on_nodes(pressed))
-        size, image = estimate.magnitudes, estimate.map
-        if size is None and image is None:
-            size = np.full(len(areas), np.nan)
-        elif size is None and image is not None:
-            share = np.maximum(areas.on_map.sum(axis=(1, 2)), 1e-12)
-            size = np.asarray((image * (areas.on_map > 0)).sum(axis=(1, 2)) / share)
-        assert size is not None
-        return areas, size, np.broadcast_to(estimate.magnitude_sigmas, len(areas))
-
-
-def _judged(measurement: Measurement, agrees: Mapping[str, bool]) -> dict[str, CompanionForce]:
-    """The companions of a frame, with what became of each."""
-    late = {k: replace(one, state="late") for k, one in measurement.late_companions.items()}
-    words = {True: "fitted", False: "disputed", None: "unused"}
-    in_time = measurement.companions.items()
-    return late | {k: replace(one, state=words[agrees.get(k)]) for k, one in in_time}
 
 
 class _Still(NamedTuple):
