@@ -110,6 +110,7 @@ FIRMWARE_STEP = (
     "the line is good: correct the firmware, by firmware_protocol/PROTOCOL.md; the event "
     "firmware_fault names the rule"
 )
+CABLE_STEP = "check the cable, its shield and the baud rate"
 TARING = ("warning", "a reference is being taken", "leave the skin alone until it runs")
 
 
@@ -153,7 +154,7 @@ def _of_port(port: Mapping[str, Any]) -> Iterator[HealthIssue]:
     recent = port.get("received_last_minute") or {}
     counts = [recent.get(name) or 0 for name in ("packets", "corrupt", "faulty")]
     for count, happened, step in (
-        (counts[1], "came damaged", "check the cable, its shield and the baud rate"),
+        (counts[1], "came damaged", CABLE_STEP),
         (counts[2], "broke the protocol", FIRMWARE_STEP),
     ):
         if count > CORRUPT_NOTED * sum(counts):

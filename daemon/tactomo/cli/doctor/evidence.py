@@ -31,7 +31,13 @@ from tactomo.errors import TactomoError
 from tactomo.recordings.imported_scans import AT_REST, is_single_ended, load_arrays, read_scans
 from tactomo.recordings.recording import Recording
 from tactomo.running import running
-from tactomo.service.health_issues import CORRUPT_NOTED, FIRMWARE_STEP
+from tactomo.service.health_issues import (
+    CABLE_STEP,
+    CORRUPT_NOTED,
+    DROPPED_NOTED,
+    FEWEST_INCOMPLETE,
+    FIRMWARE_STEP,
+)
 
 if TYPE_CHECKING:
     from tactomo_client.connection import Connection
@@ -356,9 +362,7 @@ def _fitting_pattern(
     return found[0]
 
 
-LOST_SHARE = 0.01  # of the dual scans: less is advice
 LATE_SHARE = 0.5  # what a busy computer does to fewer is advice: most frames are in time
-FEWEST_LOST = 3  # below that it is no rate: one of the first 41 says little of the next thousand
 
 
 def stream_findings(evidence: Evidence) -> list[Finding]:
@@ -390,7 +394,7 @@ def _packets_found(heard: Heard) -> Finding:
         "packets",
         Level.FAULT if share > CORRUPT_NOTED else Level.ADVICE,
         f"{heard.corrupt} of {total} came damaged ({share:.2%})",
-        "check the cable, its shield and the baud rate",
+        CABLE_STEP,
         {**figures},
     )
 
@@ -402,9 +406,9 @@ def _lost_found(evidence: Evidence, lost: int) -> Finding:
         return Finding("lost_scans", Level.OK, f"none of {count} dual scans", "", figures)
     # Scans that came and were left out tell that the computer was busy: then others may have been
     # lost for the same reason, and nothing is known against cable and board.
-    is_busy = evidence.left_out > LOST_SHARE * count
+    is_busy = evidence.left_out > DROPPED_NOTED * count
     share = lost / (count + lost)
-    is_fault = share > (LATE_SHARE if is_busy else LOST_SHARE) and lost >= FEWEST_LOST
+    is_fault = share > (LATE_SHARE if is_busy else DROPPED_NOTED) and lost >= FEWEST_INCOMPLETE
     return Finding(
         "lost_scans",
         Level.FAULT if is_fault else Level.ADVICE,
