@@ -267,7 +267,7 @@ def test_a_command_of_one_who_was_revoked_ends(
             commander.status()
 
 
-def test_without_a_doorkeeper_the_door_stays_shut(robot: Robot) -> None:
+def test_without_access_control_nobody_gets_in(robot: Robot) -> None:
     """ZeroMQ's own default lets everybody in when nobody is there to ask."""
     keys = Keys.load(robot.allow(robot.client("desk"), may_command=True))
     secret = read_secret(key_files.secret_path(robot.folder, SERVER))[1]
@@ -280,7 +280,7 @@ def test_without_a_doorkeeper_the_door_stays_shut(robot: Robot) -> None:
         assert not server.poll(0)
 
 
-def test_a_doorkeeper_that_dies_is_noticed_and_can_be_stopped(
+def test_access_control_that_dies_is_noticed_and_can_be_stopped(
     robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def trip(*_: object) -> bool:

@@ -103,6 +103,7 @@ def test_who_asks_a_lot_and_reads_the_answers_is_not_cut(daemon: DaemonProcess) 
             dealer.recv_multipart()
     assert not cut.poll(0)
     dealer.disable_monitor()
+    cut.close()
     dealer.close()
 
 
