@@ -29,18 +29,19 @@ class FrozenConverters:
         """Take the next dual scan for the first one."""
         self._repeats.forget()
 
-    def without(self, volts: Volts, reference: Reference | None) -> Volts:
+    def without(self, volts: Volts, reference: Reference | None, is_taring: bool) -> Volts:
         """What was measured of a dual scan; told when that changes for a channel.
 
         A channel that repeats itself is left out; voltages of one that does so in part are NaN.
+        While somebody tares, a channel is not left out for having less noise than at the last tare.
         """
         measured: Volts = {}
         for channel, scan in volts.items():
             found = self._repeats.find(channel, scan, reference)
-            if found is None:
+            if found is None or (is_taring and found.is_another):
                 measured[channel] = scan
                 continue
-            parts, repeated = found
+            parts, repeated, _ = found
             if repeated.any():
                 what = f"{channel} {', '.join(parts) or 'scans'}"
                 self._on_event(

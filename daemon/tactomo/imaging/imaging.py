@@ -302,7 +302,7 @@ class Imaging:
             self._reconstructor.forget_shape()
         volts = {scan.channel: scan.volts for scan in dual.scans}
         self._publish_scan(dual, timing, volts)
-        volts = self._frozen.without(volts, self.reference)
+        volts = self._frozen.without(volts, self.reference, self.taring.is_on)
         before = None if self._doubt is None else self._doubt.before
         if before is not None and before.reference.is_at_rest(volts):
             self._restore(before)

@@ -31,6 +31,9 @@ class Repeated(NamedTuple):
 
     parts: tuple[str, ...]  # in words: drives and measuring pairs; none where all is repeated
     voltages: BoolArray  # (M,)
+    # whether it differs from every earlier scan by more than a last bit: noise that has fallen, if
+    # somebody says so by a tare
+    is_another: bool = False
 
     def without(self, scan: FloatArray) -> FloatArray | None:
         """What was measured of the scan (M,), NaN elsewhere; None where all is repeated."""
@@ -72,7 +75,10 @@ class Repeats:
             changes = (scan[told] - earlier[:, told]) / noise[told]
             squares = np.einsum("nm,nm->n", changes, changes)
         if (squares < 2 * MIN_NOISE**2 * np.count_nonzero(told)).any():
-            return Repeated((), np.ones(len(scan), bool))
+            apart = np.abs(scan - earlier)
+            last_bit = apart.min(initial=np.inf, where=apart > 0)
+            is_another = bool(np.median(apart, axis=1).min() > 1.5 * last_bit)
+            return Repeated((), np.ones(len(scan), bool), is_another)
         same = scan == earlier[-1]
         if np.count_nonzero(same) < self._sizes.min():
             return Repeated((), np.zeros(len(scan), bool))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -52,6 +53,26 @@ def test_a_round_of_buffers_that_are_sent_again_is_no_measurement(bench: Start) 
         frame = b.listener.frame(b.skin.counter)
         assert number < 3 or {"magnitude_missing", "structure_missing"} <= set(frame["flags"])
     assert b.step(0.1)["flags"] == []
+
+
+def test_a_tare_ends_what_a_tare_amid_interference_began(bench: Start) -> None:
+    """Scans with a hundredth of the noise of the tare are no measurement until the next tare."""
+    b = bench(ports=2, lossless=True).tare()
+    rng = np.random.default_rng(8)
+
+    def tare(noise_v: float) -> None:
+        with ThreadPoolExecutor(1) as terminal:
+            answer = terminal.submit(b.ask, "tare")
+            while not answer.done():
+                b.step(volts={c: REST + rng.normal(0, noise_v, len(REST)) for c in BOTH})
+            answer.result()
+
+    tare(5e-4)
+    for _ in range(3):
+        frame = b.step()
+    assert {"magnitude_missing", "structure_missing"} <= set(frame["flags"])
+    tare(2e-6)
+    assert b.step()["flags"] == []
 
 
 def test_drives_that_repeat_are_left_out_and_the_rest_is_imaged(bench: Start) -> None:

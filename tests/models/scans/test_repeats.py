@@ -30,6 +30,7 @@ def share_that_repeats(paper: SensorDescription, scan: Callable[[int, FloatArray
         repeats.find(Channel.MAGNITUDE, np.asarray(scan(n, at_rest[-1])), reference)
         for n in range(40)
     ]
+    assert not any(each is not None and each.is_another for each in found), "no tare may take it"
     return sum(each is not None and bool(each.voltages.all()) for each in found)
 
 
