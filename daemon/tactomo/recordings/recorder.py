@@ -255,13 +255,12 @@ class Recorder(Worker):
             self._finish(active)
             detail = f"{active.path}: {active.bytes_written} bytes"
             self._on_event("recording_stopped", detail)
-        elif not is_wanted:
-            raise CommandError(
-                "nothing is being recorded", "start with record_start", "not_recording"
-            )
-        if self._last is None:
+        elif not is_wanted and not self.failure:
+            step = "start with `tactomo record start`"
+            raise CommandError("nothing is being recorded", step, "not_recording")
+        if self._last is None or (active is None and self.failure):
             raise RecordingError(
-                f"no recording was kept: {self.failure or why}", _REST, "cannot_write"
+                f"the recording ended early: {self.failure or why}", _REST, "cannot_write"
             )
         path, length = self._last
         return {"path": str(path), "bytes": length}

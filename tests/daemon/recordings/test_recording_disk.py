@@ -271,10 +271,12 @@ def test_a_deleted_file_or_folder_is_noticed(bench: Start, tmp_path: Path) -> No
     path.unlink()
     step_until(b, lambda: told(b, "recording_failed"))
     assert "deleted" in told(b, "recording_failed")[0]["detail"]
+    with pytest.raises(ControlError, match=r"the recording ended early: .*deleted"):
+        b.ask("record_stop")
     b.ask("record_start")
     shutil.rmtree(folder)
     step_until(b, lambda: b.ask("status")["recorder"]["waits_for"])
-    with pytest.raises(ControlError, match=r"no recording was kept: .*deleted"):
+    with pytest.raises(ControlError, match=r"the recording ended early: .*deleted"):
         b.ask("record_stop")
     assert b.ask("status")["recorder"]["waits_for"] is None
     b.ask("record_start")
