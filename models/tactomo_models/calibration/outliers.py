@@ -62,5 +62,5 @@ def _off(place: int, kpa: FloatArray, magnitude: FloatArray, sigma: FloatArray) 
     high = fit[others > own + near].min(initial=leap)
     beyond = max(low - magnitude[place], magnitude[place] - high)
     # A rising fit takes about every second reading's own deviation for the response's.
-    scatter = 2 * robust_sigma((magnitudes - fit)[answered])
+    scatter = 2 * robust_sigma((magnitudes - fit)[answered]) if answered.any() else 0.0
     return float(beyond / max(scatter, MIN_SIGMA * float(fit[-1]), sigma[place], 1e-12))

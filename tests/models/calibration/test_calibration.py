@@ -20,6 +20,7 @@ from tactomo_models.calibration.calibration_file import (
     calibration_for,
 )
 from tactomo_models.calibration.curve import Reading, directions_of, fit_curve, still_wanted
+from tactomo_models.calibration.outliers import find_outliers
 from tactomo_models.scene.pressure import pressures_of
 
 Response = Callable[[FloatArray], FloatArray]
@@ -166,6 +167,11 @@ def test_readings_that_make_no_curve_are_refused_with_the_reason(
 ) -> None:
     with pytest.raises(CalibrationError, match=said):
         fit_curve(readings)
+
+
+@pytest.mark.filterwarnings("error")
+def test_of_readings_without_an_answer_none_is_odd() -> None:
+    assert find_outliers(readings_of(LEVELS / 3)) == []
 
 
 def test_it_is_said_what_is_still_wanted_until_it_is_enough() -> None:
