@@ -18,7 +18,8 @@ from tactomo_client import Contact, ControlError, aio
 from tactomo_client.fake import FakeSensor
 from waiting import repeated, wait_until
 
-README = (Path(__file__).parents[2] / "clients" / "python" / "README.md").read_text("utf-8")
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "clients" / "python" / "README.md").read_text("utf-8")
 EXAMPLES = {
     heading.strip(): code
     for section in README.split("\n## ")[1:]
@@ -59,6 +60,16 @@ def run_until(heading: str, is_enough: Callable[[tuple[Any, ...]], bool]) -> Pri
 
     wait_until(ends, "what an example prints")
     return printed
+
+
+def test_the_front_page_prints_a_touch_of_unknown_pressure(monkeypatch: pytest.MonkeyPatch) -> None:
+    light = Contact(1, 10.0, -5.0, 700.0, None, None, None)
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.S)
+    frames = [SimpleNamespace(contacts=[light])]
+    monkeypatch.setattr(tactomo_client, "subscribe", lambda _: frames)
+    printed: list[tuple[Any, ...]] = []
+    exec(code, {"print": lambda *values: printed.append(values)})
+    assert printed
 
 
 def test_there_is_a_test_of_every_example() -> None:
