@@ -14,7 +14,7 @@ import traceback
 from tactomo.cli.commands import app
 from tactomo.ending import watch_parent
 from tactomo.errors import explain
-from tactomo.plain import plain
+from tactomo.plain import is_journal, plain, with_priority
 
 __all__ = ["app", "main"]
 
@@ -46,8 +46,6 @@ def _flush() -> None:
 
 def _print_error(what: Exception | str) -> None:
     """Print an error, or the traceback of a mistake of ours; as an error, where journald reads."""
-    from tactomo.plain import is_journal, with_priority
-
     text = (
         plain(what) if isinstance(what, str) else "".join(traceback.format_exception(what)).rstrip()
     )

@@ -15,28 +15,38 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
+from tactomo_client import Frame, Status
 from tactomo_client.recording import open_recording
 from tactomo_models import CalibrationError, load_description
 from tactomo_models.calibration import load_cell
-from tactomo_models.calibration.calibration_file import PressureCalibration, Subject, subject_of
+from tactomo_models.calibration.calibration_file import (
+    SUFFIX,
+    PressureCalibration,
+    Subject,
+    subject_of,
+)
+from tactomo_models.calibration.curve import (
+    MAX_KPA,
+    Fit,
+    Reading,
+    directions_of,
+    fit_curve,
+    still_wanted,
+)
 from tactomo_models.calibration.outliers import find_outliers
+from tactomo_models.foreign_file import open_regular
+from tactomo_models.scans.plausibility import DISTRUST
 
+from tactomo.cli.console import Console
 from tactomo.cli.files.recorded_frames import recorded_frames
 from tactomo.cli.options import DEFAULT_DESCRIPTION
 from tactomo.cli.output import say
 from tactomo.cli.steer.watch import View
 from tactomo.errors import TactomoError, os_errors_as
 from tactomo.recordings.recording import open_recording as open_bytes
-
-if TYPE_CHECKING:
-    from tactomo_client import Frame, Status
-    from tactomo_models.calibration.calibration_file import PressureCalibration, Subject
-    from tactomo_models.calibration.curve import Fit, Reading
-
-    from tactomo.cli.console import Console
 
 STILL_S: Final = 1.0  # for how long a press is to be held still, and is averaged
 MIN_FRAMES: Final = 5
@@ -74,10 +84,6 @@ def guided(
 
     Raises TactomoError without a magnitude channel, CalibrationError where readings are too few.
     """
-    from tactomo_models.calibration.calibration_file import SUFFIX, PressureCalibration
-
-    from tactomo.cli.console import Console
-
     console = Console(highlight=False, soft_wrap=True)
     log = path.with_name(path.name.removesuffix(SUFFIX) + ".readings.csv")
     subject = _subject(status)
@@ -92,15 +98,11 @@ def guided(
 
 def distrusted(frame: Frame) -> frozenset[str]:
     """Return those flags of a frame that make it untrustworthy."""
-    from tactomo_models.scans.plausibility import DISTRUST
-
     return frame.flags & frozenset(DISTRUST.names())
 
 
 def _subject(status: Status) -> Subject:
     """Return what is calibrated; TactomoError for a sensor that measures no magnitude."""
-    from tactomo_models.calibration.calibration_file import Subject
-
     description = status.description
     if description is None or "magnitude" not in description.modalities:
         raise TactomoError(
@@ -191,8 +193,6 @@ class _Session:
 
     def _largest_n(self) -> float:
         """By what no skin bears: a slip beyond that would spoil the fit of all others."""
-        from tactomo_models.calibration.curve import MAX_KPA
-
         assert self._area_mm2 is not None
         return MAX_KPA * 1e-3 * self._area_mm2
 
@@ -249,7 +249,6 @@ class _Session:
         return "" if _are_still(frames) else "moving: hold it still"
 
     def _keep(self, held: Held, force_n: float) -> None:
-        from tactomo_models.calibration.curve import directions_of
 
         assert self._area_mm2 is not None
         kpa = 1e3 * force_n / self._area_mm2
@@ -281,7 +280,6 @@ class _Session:
         self._console.print(f"dropped the reading at {dropped.pressure_kpa:.0f} kPa")
 
     def _print_progress(self) -> None:
-        from tactomo_models.calibration.curve import still_wanted
         from tactomo_models.calibration.outliers import find_outliers
 
         if not self.readings:
@@ -303,9 +301,6 @@ class _Session:
 
 
 def _fit_so_far(readings: Sequence[Reading]) -> Fit | None:
-    from tactomo_models import CalibrationError
-    from tactomo_models.calibration.curve import fit_curve
-
     try:
         return fit_curve(readings)
     except CalibrationError:
@@ -345,17 +340,13 @@ def _mean_of(frames: Sequence[Frame]) -> Held:
 
 
 def _read_log(log: Path) -> list[Reading]:
-    from tactomo_models.calibration.load_cell import direct_readings, read_load_cell
-
     if not log.exists() or _is_begun(log):
         return []
-    return list(direct_readings(read_load_cell(log)).readings)
+    return list(load_cell.direct_readings(load_cell.read_load_cell(log)).readings)
 
 
 def _is_begun(log: Path) -> bool:
     """Whether a log has its line of names and nothing else."""
-    from tactomo_models.foreign_file import open_regular
-
     with open_regular(log) as file:
         return not any(line.strip() for line in islice(file, 1, 3))
 

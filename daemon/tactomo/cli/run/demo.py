@@ -19,7 +19,7 @@ import typer
 from tactomo.cli import options
 from tactomo.cli.output import say
 from tactomo.endpoint import free_addresses
-from tactomo.running import running
+from tactomo.running import Running, announced, running
 
 if TYPE_CHECKING:
     from tactomo.cli.children import ProcessGroup
@@ -256,11 +256,6 @@ def twin(
         float | None,
         typer.Option(min=0.0, max=1e9, help="Converter noise, µV rms. [60 dB below the signal]"),
     ] = None,
-    unevenness: Annotated[
-        float,
-        typer.Option(min=0.0, max=0.5, help="Unevenness of the sheet's conductivity; 0.05 is 5 %."),
-    ] = 0.03,
-    seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal noise and drift.")] = 0,
     twin_control: Annotated[
         str, typer.Option("--twin-control", help="Address for `tactomo poke`.")
     ] = options.DEFAULT_TWIN_CONTROL,
@@ -275,7 +270,6 @@ def twin(
     from tactomo_models import load_description
 
     from tactomo.cli.children import interrupt_at_end, print_ready
-    from tactomo.running import Running, announced
     from tactomo.twin import Twin, TwinConfig, load_scene
 
     interrupt_at_end()
@@ -286,25 +280,23 @@ def twin(
         ports=lines if ports is None else ports,
         rate_hz=rate,
         noise_v=None if noise_uv is None else noise_uv * 1e-6,
-        unevenness=unevenness,
-        seed=seed,
         scene=None if scene is None else load_scene(scene),
         protocol=protocol,
         control=twin_control,
         link_folder=link,
     )
-    running = Twin(config)
-    running.start()
-    paths = tuple(map(str, running.ports))
+    simulated = Twin(config)
+    simulated.start()
+    paths = tuple(map(str, simulated.ports))
     try:
-        with announced(Running("twin", running.control, ports=paths)):
+        with announced(Running("twin", simulated.control, ports=paths)):
             for path in paths:
                 say(f"port     {path}")
-            say(f"control  {running.control}, for `tactomo poke`")
+            say(f"control  {simulated.control}, for `tactomo poke`")
             if announce:
-                print_ready({"ports": paths, "control": running.control})
-            running.wait()
+                print_ready({"ports": paths, "control": simulated.control})
+            simulated.wait()
     except KeyboardInterrupt:
         pass
     finally:
-        running.stop()
+        simulated.stop()
