@@ -280,8 +280,6 @@ class _Session:
         self._console.print(f"dropped the reading at {dropped.pressure_kpa:.0f} kPa")
 
     def _print_progress(self) -> None:
-        from tactomo_models.calibration.outliers import find_outliers
-
         if not self.readings:
             return
         fit = _fit_so_far(self.readings)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from tactomo_client import Keys
@@ -19,11 +19,9 @@ from tactomo_models.calibration.calibration_file import Subject
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.sensor.description import SensorDescription
 
+from tactomo.cli.console import Console
 from tactomo.cli.doctor.evidence import Evidence, of_daemon
 from tactomo.errors import TactomoError, os_errors_as
-
-if TYPE_CHECKING:
-    from tactomo.cli.console import Console
 
 REST_S: Final = 2.0
 HOLD_S: Final = 1.0  # for how long a press is to be held still
@@ -46,8 +44,6 @@ def guided(
 
     Raises TactomoError where no daemon answers, or the file is of other presses.
     """
-    from tactomo.cli.console import Console
-
     console = Console(highlight=False, soft_wrap=True)
     return _Session(sensor, stream, as_keys(keys), description, file, console).run()
 

@@ -16,17 +16,15 @@ from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from tactomo_client.touch import CONTACT_COLUMNS, Touch
 from tactomo_models.arrays import FloatArray
 from tactomo_models.foreign_file import open_regular
 
 from tactomo.cli.files.recorded_frames import Gaps, TimedFrame
 from tactomo.errors import TactomoError, needs
-
-if TYPE_CHECKING:
-    from tactomo_client.touch import Touch
 
 CLOCKS: Final = ("monotonic_s", "realtime_s")
 ACTION: Final = "action."
@@ -198,7 +196,6 @@ def write_dataset(
     no map, the clock that is aligned by was set, or no rate is known.
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
-    from tactomo_client.touch import Touch
 
     held = list(_up_to_first_map(moments))
     if not held:
@@ -307,8 +304,6 @@ def _values(
 
 
 def _features(values: Mapping[str, Any], log: RobotLog | None) -> dict[str, Any]:
-    from tactomo_client.touch import CONTACT_COLUMNS
-
     parts = {} if log is None else log.parts
     names = {part: [log.columns[n] for n in numbers] for part, numbers in parts.items() if log}
     columns = {"fields": list(CONTACT_COLUMNS)}

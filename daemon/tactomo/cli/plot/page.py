@@ -7,8 +7,12 @@ from collections.abc import Callable, Iterable, Sequence
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, Final
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator
 from tactomo_client import Contact, Frame
@@ -79,8 +83,6 @@ def _has_data(panel: str, course: Course) -> bool:
 
 
 def _contact_colours(course: Course) -> dict[str, Any]:
-    import matplotlib as mpl
-
     palette = mpl.colormaps["tab10"].colors  # type: ignore[attr-defined]
     return {name: palette[i % len(palette)] for i, name in enumerate(course.tracks)}
 
@@ -92,9 +94,6 @@ def draw_strip(
     titles: Sequence[str],
 ) -> None:
     """Draw the frames' maps side by side, on one scale, with a bar of its colours as tall."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import LinearSegmentedColormap, Normalize
-
     about = {} if description is None else description_fields(description)
     axes_row = np.atleast_1d(figure.subplots(1, len(frames), sharey=True))
     for axes, frame, title in zip(axes_row, frames, titles, strict=True):
@@ -115,8 +114,6 @@ def draw_strip(
 
 def _cut_out(axes: Any, description: SensorDescription) -> None:
     """Show a map within the sheet's outline alone."""
-    from matplotlib.patches import PathPatch
-
     shape = PathPatch(outline_path(description), transform=axes.transData)
     for image in axes.images:
         image.set_clip_path(shape)
