@@ -25,7 +25,8 @@ commissioning    teaching one skin, and objects on that skin at a start
 simulators       the skin in MuJoCo
 ===============  =================================================================================
 
-Below the last two, `reconstruct` turns scans into frames, and `batch` does so for a file.
+Below the last two, `reconstruct` turns scans into frames, which `frames` makes of estimates, and
+`batch` does so for a file.
 """
 
 from __future__ import annotations
