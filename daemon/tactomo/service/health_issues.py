@@ -28,12 +28,12 @@ FLAG_ERRORS = frozenset(
 """Flags of what has to be mended before frames say what presses; the others are warnings."""
 FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
     "magnitude_missing": (
-        "no scans of the magnitude channel",
-        "check that channel's port and cable; until then pressures are unknown",
+        "no usable scans of the magnitude channel",
+        "check that channel's port, cable and last event; until then pressures are unknown",
     ),
     "structure_missing": (
-        "no scans of the structure channel",
-        "check that channel's port and cable; until then shapes are coarser",
+        "no usable scans of the structure channel",
+        "check that channel's port, cable and last event; until then shapes are coarser",
     ),
     "no_reference": ("not tared yet", "leave the skin alone and run `tactomo tare`"),
     "reference_mismatch": (

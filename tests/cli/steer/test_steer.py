@@ -97,7 +97,7 @@ def test_status_shows_what_matters(tactomo: Run, control: Any) -> None:
         ),
         *(
             "p50 4.25 ms",
-            "structure_missing: no scans of the structure channel",
+            "structure_missing: no usable scans of the structure channel",
             "19.96 frames/s",
             "2 dual scans dropped",
         ),

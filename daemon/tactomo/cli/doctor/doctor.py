@@ -147,9 +147,11 @@ def _of_file(
         recording = open_recording(what)
         warn_of_damage(recording)
         return of_recording(recording, description, frames)
-    if suffix in (".npz", *READERS):
+    scans = (".npz", *READERS)
+    if suffix in scans:
         return of_arrays(what, description, array, pattern, frames)
-    raise TactomoError(f"{what} is neither .mcap nor .npz", "give a recording, scans, or no file")
+    step = f"give a recording (.mcap), scans ({', '.join(scans)}), or no file"
+    raise TactomoError(f"{what} is of no kind that is read", step)
 
 
 def _diagnose(evidence: Evidence) -> dict[str, Diagnosis]:
