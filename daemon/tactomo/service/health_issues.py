@@ -196,7 +196,7 @@ def _of_losses(status: Mapping[str, Any]) -> Iterator[HealthIssue]:
         # A busy computer loses scans, too: then nothing is known against the cable.
         severity = "warning" if is_busy or incomplete < FEWEST_INCOMPLETE else "error"
         cable = "check the cable of the channel that is missing; if it comes late, sync_wait_ms"
-        step = FASTER if is_busy else cable
+        step = f"{FASTER}; and {cable}" if is_busy else cable
         yield HealthIssue(severity, f"{incomplete} {of} lacked a channel", step)
 
 

@@ -178,6 +178,7 @@ def test_what_is_lost_is_told_by_counts_of_the_last_minute(tactomo: Run, control
     shown = tactomo("status").stdout
     assert "150 of 750 dual scans within the last minute were left out" in shown
     assert "600 of 750 dual scans within the last minute lacked a channel" in shown
+    assert "check the cable of the channel" in shown  # a busy computer does not explain it all
     assert "/dev/ttyACM0 is idle\n" in shown
     over = {"last_minute": {"frames": 600, "dropped_scans": 0, "incomplete_scans": 0}}
     control.answers["status"] |= over
