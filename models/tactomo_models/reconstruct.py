@@ -17,6 +17,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from tactomo_protocol import Channel
+from threadpoolctl import ThreadpoolController
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.calibration.taught_skin import TaughtSkin
@@ -95,6 +96,7 @@ class Reconstructor:
         if isinstance(method, str):
             check_method(method, description)
         self._methods[self._name] = make_method(method) if isinstance(method, str) else method
+        self._blas = ThreadpoolController()  # last: of the libraries that are loaded by now
 
     @property
     def budget_s(self) -> float | None:
@@ -203,7 +205,8 @@ class Reconstructor:
             self._measured(Channel.MAGNITUDE, magnitude),
             self._measured(Channel.STRUCTURE, structure),
         )
-        return self.solve(self.compare(*scans, saturated=saturated, companions=companions))
+        with self._blas.limit(limits=1):  # more threads wait for each other
+            return self.solve(self.compare(*scans, saturated=saturated, companions=companions))
 
     def compare(
         self,

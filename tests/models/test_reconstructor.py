@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import astuple, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from tactomo_models import (
     SkinSimulator,
     load_description,
 )
+from threadpoolctl import threadpool_info, threadpool_limits
 
 CENTRE = Press(0.0, 0.0, 180.0)
 
@@ -90,6 +92,22 @@ def test_nothing_pressed_takes_a_test_and_no_solve(
     assert {frame.tier for frame in frames} == {"quiet"}
     assert not solves
     assert all(frame.map is not None and not frame.map.any() for frame in frames)
+
+
+def test_a_frame_takes_one_thread(
+    reconstructor: Reconstructor, skin: Skin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside another program, two threads took twenty times the processor time of one."""
+    solve, threads = Reconstructor.solve, set[int]()
+
+    def watched(self: Reconstructor, measurement: Any) -> Reconstruction:
+        threads.update(each["num_threads"] for each in threadpool_info())
+        return solve(self, measurement)
+
+    monkeypatch.setattr(Reconstructor, "solve", watched)
+    with threadpool_limits(2):
+        reconstructor.reconstruct(**skin.scan(CENTRE))
+    assert threads == {1}
 
 
 def test_a_still_scene_takes_no_further_solve(
