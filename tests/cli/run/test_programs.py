@@ -102,7 +102,7 @@ def test_what_a_user_can_cause_is_told_without_a_traceback(
 
 
 def test_a_speed_that_is_none_is_a_usage_error(tactomo: Run, tmp_path: Path) -> None:
-    for speed in ("fast", "-1", "nan"):
+    for speed in ("fast", "-1", "nan", "0"):
         tactomo("replay", "none.mcap", "--speed", speed, status=2)
 
 

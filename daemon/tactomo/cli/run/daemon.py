@@ -248,10 +248,12 @@ def _prepare(settings: DaemonConfig) -> None:
 
 
 def _speed(text: str) -> float:
+    if text == "max":
+        return 0.0
     try:
-        factor = 0.0 if text == "max" else float(text)
+        factor = float(text)
     except ValueError:
         factor = -1.0
-    if factor and not 1e-3 <= factor <= 1e3:
+    if not 1e-3 <= factor <= 1e3:
         raise typer.BadParameter(f"--speed {text}: give a factor from 0.001 to 1000, or max")
     return factor
