@@ -94,6 +94,24 @@ def test_nothing_pressed_takes_a_test_and_no_solve(
     assert all(frame.map is not None and not frame.map.any() for frame in frames)
 
 
+@pytest.mark.parametrize("noise", [0.03, 0.1])  # of the voltages, at the tare and after
+def test_what_noise_hides_is_not_told_as_nothing_pressed(
+    reconstructor: Reconstructor, skin: Skin, noise: float
+) -> None:
+    rng = np.random.default_rng(1)
+
+    def noisy(*presses: Press) -> dict[str, Any]:
+        volts = {str(c): v for c, v in skin.scan(*presses).items()}
+        return {c: v + noise * np.std(v) * rng.standard_normal(v.shape) for c, v in volts.items()}
+
+    rest = [noisy() for _ in range(20)]
+    scans = (np.array([each[c] for each in rest]) for c in ("magnitude", "structure"))
+    reconstructor.set_reference(Reference.from_scans(*scans))
+    for _ in range(8):
+        frame = reconstructor.reconstruct(**noisy(press_mm(0, 0, radius_mm=6.0)))
+        assert frame.contacts or Flag.NOISE_HIGH in frame.flags
+
+
 def test_a_frame_takes_one_thread(
     reconstructor: Reconstructor, skin: Skin, monkeypatch: pytest.MonkeyPatch
 ) -> None:

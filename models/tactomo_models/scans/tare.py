@@ -38,6 +38,7 @@ from tactomo_models.sensor.description import SensorDescription
 
 LEFT_OUT: Final = Flag.ELECTRODE_FAULT | Flag.INVALID_VOLTAGE  # what is known to be missing
 NOISELESS = 1e-9  # of the largest voltage: the noise of data that have none
+NOISY: Final = 0.016  # of the voltages (36 dB, where the doctor says ill): hides a fingertip
 UNUSABLE = 1e3  # relative error of a voltage whose reference is zero or no number
 MUCH_MORE: Final = 5.0  # ratio of the channels' contrasts (logarithms) that tells them apart
 
@@ -130,6 +131,8 @@ class ChannelTare:
         self.reference = np.where(valid, volts, 0.0)
         noise = np.where(valid, noise, 0.0)
         noiseless = NOISELESS * float(np.abs(self.reference).max(initial=0.0))
+        noisy = NOISY * float(np.linalg.norm(self.reference))
+        self._is_noisy = float(np.linalg.norm(noise)) > noisy
         of_change = np.maximum(noise * np.sqrt(1 + 1 / scans), noiseless)
         size = np.abs(self.reference)
         self._per_volt = np.divide(1, size, out=np.zeros_like(size), where=valid)
@@ -237,8 +240,8 @@ class ChannelTare:
         total = self._total
         if not (quiet or electrodes) and _fell(total * change, total**2 * variance):
             flags |= Flag.REFERENCE_MISMATCH
-        common, beyond, hides = 1.0, np.inf, False
-        if quiet and ratio > 1:
+        common, beyond, hides = 1.0, np.inf, quiet and self._is_noisy
+        if quiet and ratio > 1 and not hides:
             hides = self._hides(change, variance, freedom, count)
         if not quiet:
             over = 1 + (change * np.sign(self.reference))[valid]
