@@ -294,10 +294,13 @@ class Fit:
         assert belief is not None
         if course.account is not None and belief.how == "still" and belief.done:
             return course.account
+        # Where the frame is still, it is of the frame that was fitted.
+        jacobian = None if belief.how == "still" else belief.account.jacobian
         return self._accountant.account(
             belief.account.fitted,
             belief.judged(measurement.data),
             belief.alternatives,
+            jacobian,
         )
 
     def _concluded(self, course: Course, measurement: Measurement) -> Estimate:

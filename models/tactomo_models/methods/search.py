@@ -567,7 +567,9 @@ class Search:
         if len(ends) == 1 and ends[0] is not None:
             every, log_ratio = ends[0].every, ends[0].log_ratio
         start = self._account(every, log_ratio, frame)
-        changed = self._descended(start, frame, self._steps(account, frame))
+        changed = self._descended(start, frame, FEW_STEPS)
+        if at_end(self.fit, changed, frame).log_evidence > account.log_evidence + HOPELESS:
+            changed = self._descended(changed, frame, self._steps(account, frame) - FEW_STEPS)
         gain = changed.log_evidence - account.log_evidence
         at = np.cumsum([0, *map(len, rows)])
         rivals: list[Rivals] = []

@@ -91,9 +91,13 @@ class FieldAccountant:
         measured: Measured,  # the data that it explains
         # of each contact; where they are likely, images and numbers are the mean of all
         alternatives: Sequence[Sequence[Alternative]] = (),
+        # (sum M, N + 1) of its weighted residual; None where it is not known yet
+        jacobian: FloatArray | None = None,
     ) -> FieldAccount:
         """Account for a field."""
-        shown = self._drawn(fitted, measured)
+        if jacobian is None:
+            jacobian = self._fit.jacobian(fitted, measured)
+        shown = self._drawn(fitted, measured, jacobian)
         family = fitted.family
         if not isinstance(family, PressureField) or not len(shown.areas):
             return shown
@@ -107,17 +111,17 @@ class FieldAccountant:
                 shown = self._mixed(shown, family, each[k], likely, np.flatnonzero(owner == k))
         return shown
 
-    def _sensed(self, fitted: FittedField, measured: Measured) -> FloatArray:
+    def _sensed(self, fitted: FittedField, measured: Measured, J: FloatArray) -> FloatArray:
         """Derivative (sum M, N + 1) of the weighted residual by the parameters and the log ratio.
 
         Below its onset a graded sheet answers to nothing. What it would answer to is what bounds a
         light contact's pressure, so that there it is differentiated at its onset.
         """
-        J, family = self._fit.jacobian(fitted, measured), fitted.family
+        family = fitted.family
         if not isinstance(family, PressureField) or Channel.MAGNITUDE not in measured:
             return J
         if family.light(fitted.parameters).any():
-            sensed = self._fit.jacobian_at_onset(fitted, measured)
+            sensed, J = self._fit.jacobian_at_onset(fitted, measured), J.copy()
             start = [*measured].index(Channel.MAGNITUDE) * len(sensed)
             J[start : start + len(sensed)] = sensed
         return J
@@ -129,7 +133,7 @@ class FieldAccountant:
         precision = self._fit.prior(fitted)[0]
         return np.asarray(np.linalg.inv(information + np.diag(precision)), np.float64)
 
-    def _drawn(self, fitted: FittedField, measured: Measured) -> FieldAccount:
+    def _drawn(self, fitted: FittedField, measured: Measured, J: FloatArray) -> FieldAccount:
         near, (solid, share, pressure) = self._images(fitted)
         image = partial(self._image, near)
         covered, whole = image(share), image(solid)
@@ -139,7 +143,7 @@ class FieldAccountant:
         areas = self._areas.find(whole, there)
         mine = areas.on_nodes[:, drawing.nodes] > 0
         areas = self._areas.less(areas, covered / np.maximum(whole, 1e-12))
-        known = self._contacts(fitted, measured, areas, mine)
+        known = self._contacts(fitted, measured, J, areas, mine)
         magnitude, saturation = self._responses(pressure)
         return FieldAccount(
             map=image(share * magnitude),
@@ -319,6 +323,7 @@ class FieldAccountant:
         self,
         fitted: FittedField,
         measured: Measured,
+        J: FloatArray,
         areas: Areas,
         mine: BoolArray,
     ) -> dict[str, Any]:
@@ -335,7 +340,7 @@ class FieldAccountant:
         if count == 0:
             return known
         family, drawing = fitted.family, fitted.drawing
-        J = self._sensed(fitted, measured)
+        J = self._sensed(fitted, measured, J)
         with_ratio = self._covariance(fitted, measured, J)
         covariance = with_ratio[:-1, :-1]
         by_share, by_pressure = drawing.slopes()[2:]
