@@ -18,6 +18,7 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.scans.changes import WRONG_WAY
+from tactomo_models.scans.companion_forces import SheetsAndCompanions
 from tactomo_models.scene.areas import AreaFinder, Areas
 from tactomo_models.scene.drawing import Drawing
 from tactomo_models.scene.evidence import Likelihood
@@ -26,6 +27,7 @@ from tactomo_models.scene.parameters import E1, E2, EDGE, HOLE, PEAK, SIZE, UNIT
 from tactomo_models.scene.pressure import ONE_SIDED_95, FieldContacts
 from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import GradedResponse, SaturatingResponse
+from tactomo_models.scene.size_and_peak import SizeAndPeak, along_bend
 
 # Of an outline's radius, over the nodes' distance, that no noise accounts for where a pressure is
 # even: with 0.05, 59 % of rectangles' and rings' areas are within one sigma, with 0.07, 67 %.
@@ -251,8 +253,9 @@ class FieldAccountant:
             more = float(marginal @ by_peak**2)
             own_sigmas = np.hypot(contacts.peak_magnitude_sigma[at], by_peak)
             sides = contacts.peak_magnitude_sides.copy()
+            skew = sides[:, at, None] / max(contacts.peak_magnitude_sigma[at], 1e-12)
             sides[:, at] = _sides(
-                marginal, alone.peak_magnitude, own_sigmas, share @ alone.peak_magnitude
+                marginal, alone.peak_magnitude, skew * own_sigmas, share @ alone.peak_magnitude
             )
             felt = np.array(contacts.felt, float)
             felt[at] = alone.peak_magnitude[kinds[:, EDGE].argmin()]
@@ -405,17 +408,25 @@ class FieldAccountant:
         # What magnitude and area undo of it is the pressure beyond the table's onset alone.
         by_edge = np.abs(by_outline - by_outline_kpa / peaks)
         peak_sigma = np.hypot(peak_slope * sigma(by_peak), by_outline * peak_size)
+        sides = np.stack([peak_sigma, peak_sigma])
+        total_sigma, by_bend = np.hypot(sigma(weight @ by_force), total * by_edge), np.zeros(count)
+        if isinstance(family, PressureField):
+            of_peaks, of_forces = self._along_bends(family, each, covariance)
+            sides = np.maximum(sides, of_peaks[:, owner])
+            if not isinstance(measured, SheetsAndCompanions):  # else the force itself is told
+                more = (total * of_forces[owner]) ** 2 - total_sigma**2
+                by_bend = np.sqrt(np.maximum(more, 0.0))
         known["contacts"] = FieldContacts(
             peak_magnitude=peak_size,
             peak_magnitude_sigma=peak_sigma,
-            peak_magnitude_sides=np.stack([peak_sigma, peak_sigma]),
+            peak_magnitude_sides=sides,
             felt=peak_size,
             felt_sigma=peak_slope * sigma(by_peak),
             peak_kpa=peaks,
             mean_kpa=means,
             mean_sigma_kpa=np.hypot(sigma(by_mean_kpa), by_outline_kpa * means / peaks),
             force_n=1e3 * total * scale,
-            force_sigma_n=1e3 * scale * np.hypot(sigma(weight @ by_force), total * by_edge),
+            force_sigma_n=1e3 * scale * np.hypot(total_sigma, by_bend),
             edge=edges,
             total_force_n=float(1e3 * total @ scale),
             # Errors of contacts that touch go against each other; those of their outlines do not.
@@ -423,11 +434,34 @@ class FieldAccountant:
             * float(
                 np.hypot(
                     sigma((scale @ (weight @ by_force))[None])[0],
-                    np.linalg.norm(scale * total * by_edge),
+                    np.linalg.norm([scale * total * by_edge, scale * by_bend]),
                 )
             ),
         )
         return known
+
+    def _along_bends(
+        self, family: PressureField, each: FloatArray, covariance: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """How far (2, K) magnitudes under peaks may be off, in `ONE_SIDED_95`, and (K,) forces."""
+        graded, sides, forces = self._graded, np.zeros((2, len(each))), np.zeros(len(each))
+        assert isinstance(graded, GradedResponse)
+        for k, contact in enumerate(each):
+            index = family.index[k, [SIZE, PEAK]]
+            if index.min() < 0 or contact[PEAK] <= family.onset:
+                continue
+            known = SizeAndPeak(
+                contact[[SIZE, PEAK]],
+                covariance[np.ix_(index, index)],
+                family.prior_mean[index],
+                family.prior_precision[index],
+                family.limits[:, [SIZE, PEAK]],
+            )
+            bend = along_bend(known, lambda peak: graded.relative_change(family.unit_kpa * peak)[0])
+            at, least, most = self._felt(family.unit_kpa * np.append(contact[PEAK], bend.peaks))[0]
+            sides[:, k] = np.array([at - least, most - at]) / ONE_SIDED_95
+            forces[k] = bend.force_spread
+        return sides, forces
 
     def _felt(self, pressure_kpa: FloatArray) -> tuple[FloatArray, FloatArray]:
         """|Relative change| of the graded sheet and its slope; below its onset, the slope there."""
@@ -478,13 +512,16 @@ class FieldAccountant:
 def _sides(share: FloatArray, means: FloatArray, sigmas: FloatArray, told: float) -> FloatArray:
     """How far (2,) below and above a value the bounds of 95 % of normal distributions are.
 
-    In `ONE_SIDED_95`; shares, means and standard deviations are of each distribution, (n,).
+    In `ONE_SIDED_95`; shares and means are of each distribution, (n,), and standard deviations
+    (2, n) below and above its mean.
     """
-    below, above = (means - 6 * sigmas).min(), (means + 6 * sigmas).max()
+    below, above = (means - 6 * sigmas[0]).min(), (means + 6 * sigmas[1]).max()
     least, most = np.full((2, 2), [[below], [above]])
     for _ in range(24):  # bisection of both, to a millionth of a sigma
         middle = (least + most) / 2
-        is_less = ndtr((middle[:, None] - means) / np.maximum(sigmas, 1e-12)) @ share < (0.05, 0.95)
+        off = middle[:, None] - means
+        by = np.maximum(np.where(off < 0, *sigmas), 1e-12)
+        is_less = ndtr(off / by) @ share < (0.05, 0.95)
         least, most = np.where(is_less, middle, least), np.where(is_less, most, middle)
     bounds = (least + most) / 2
     return np.asarray(np.maximum([told - bounds[0], bounds[1] - told], 0.0) / ONE_SIDED_95)
