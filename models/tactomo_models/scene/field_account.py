@@ -446,6 +446,10 @@ class FieldAccountant:
         """How far (2, K) magnitudes under peaks may be off, in `ONE_SIDED_95`, and (K,) forces."""
         graded, sides, forces = self._graded, np.zeros((2, len(each))), np.zeros(len(each))
         assert isinstance(graded, GradedResponse)
+
+        def change(peak: FloatArray) -> FloatArray:
+            return graded.relative_change(family.unit_kpa * peak)[0]
+
         for k, contact in enumerate(each):
             index = family.index[k, [SIZE, PEAK]]
             if index.min() < 0 or contact[PEAK] <= family.onset:
@@ -457,9 +461,13 @@ class FieldAccountant:
                 family.prior_precision[index],
                 family.limits[:, [SIZE, PEAK]],
             )
-            bend = along_bend(known, lambda peak: graded.relative_change(family.unit_kpa * peak)[0])
+            bend = along_bend(known, change)
             at, least, most = self._felt(family.unit_kpa * np.append(contact[PEAK], bend.peaks))[0]
             sides[:, k] = np.array([at - least, most - at]) / ONE_SIDED_95
+            edge = family.index[k, EDGE]
+            if edge >= 0:  # a peak and an edge that rise together leave the force as it is
+                with_edge = np.outer(*[covariance[index, edge]] * 2) / covariance[edge, edge]
+                bend = along_bend(replace(known, covariance=known.covariance - with_edge), change)
             forces[k] = bend.force_spread
         return sides, forces
 
