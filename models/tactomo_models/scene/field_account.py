@@ -27,7 +27,7 @@ from tactomo_models.scene.parameters import E1, E2, EDGE, HOLE, PEAK, SIZE, UNIT
 from tactomo_models.scene.pressure import ONE_SIDED_95, FieldContacts
 from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import GradedResponse, SaturatingResponse
-from tactomo_models.scene.size_and_peak import SizeAndPeak, along_bend
+from tactomo_models.scene.size_and_peak import ReflectionTable, SizeAndPeak, along_bend
 
 # Of an outline's radius, over the nodes' distance, that no noise accounts for where a pressure is
 # even: with 0.05, 59 % of rectangles' and rings' areas are within one sigma, with 0.07, 67 %.
@@ -39,6 +39,7 @@ PLACE_ERROR = 0.03
 # to all of it, which ordinary skins have, none comes to two.
 FAR_RATIO = 3.0
 NEGLIGIBLE = 0.02  # share of an alternative that need not be drawn
+TABLED_PEAKS = 200  # between a peak's limits, whose reflection is looked up
 SAMPLES = 3  # per side of a map cell: what an outline covers of it is right to 3 %
 
 
@@ -97,8 +98,6 @@ class FieldAccountant:
         jacobian: FloatArray | None = None,
     ) -> FieldAccount:
         """Account for a field."""
-        if jacobian is None:
-            jacobian = self._fit.jacobian(fitted, measured)
         shown = self._drawn(fitted, measured, jacobian)
         family = fitted.family
         if not isinstance(family, PressureField) or not len(shown.areas):
@@ -113,13 +112,15 @@ class FieldAccountant:
                 shown = self._mixed(shown, family, each[k], likely, np.flatnonzero(owner == k))
         return shown
 
-    def _sensed(self, fitted: FittedField, measured: Measured, J: FloatArray) -> FloatArray:
+    def _sensed(self, fitted: FittedField, measured: Measured, J: FloatArray | None) -> FloatArray:
         """Derivative (sum M, N + 1) of the weighted residual by the parameters and the log ratio.
 
         Below its onset a graded sheet answers to nothing. What it would answer to is what bounds a
         light contact's pressure, so that there it is differentiated at its onset.
         """
         family = fitted.family
+        if J is None:
+            J = self._fit.jacobian(fitted, measured)
         if not isinstance(family, PressureField) or Channel.MAGNITUDE not in measured:
             return J
         if family.light(fitted.parameters).any():
@@ -135,7 +136,7 @@ class FieldAccountant:
         precision = self._fit.prior(fitted)[0]
         return np.asarray(np.linalg.inv(information + np.diag(precision)), np.float64)
 
-    def _drawn(self, fitted: FittedField, measured: Measured, J: FloatArray) -> FieldAccount:
+    def _drawn(self, fitted: FittedField, measured: Measured, J: FloatArray | None) -> FieldAccount:
         near, (solid, share, pressure) = self._images(fitted)
         image = partial(self._image, near)
         covered, whole = image(share), image(solid)
@@ -326,7 +327,7 @@ class FieldAccountant:
         self,
         fitted: FittedField,
         measured: Measured,
-        J: FloatArray,
+        J: FloatArray | None,
         areas: Areas,
         mine: BoolArray,
     ) -> dict[str, Any]:
@@ -447,9 +448,9 @@ class FieldAccountant:
         graded, sides, forces = self._graded, np.zeros((2, len(each))), np.zeros(len(each))
         assert isinstance(graded, GradedResponse)
 
-        def change(peak: FloatArray) -> FloatArray:
-            return graded.relative_change(family.unit_kpa * peak)[0]
-
+        lowest, highest = family.limits[:, PEAK]
+        peaks = np.geomspace(lowest, highest, TABLED_PEAKS)
+        table = ReflectionTable.of(peaks, graded.relative_change(family.unit_kpa * peaks)[0])
         for k, contact in enumerate(each):
             index = family.index[k, [SIZE, PEAK]]
             if index.min() < 0 or contact[PEAK] <= family.onset:
@@ -459,15 +460,16 @@ class FieldAccountant:
                 covariance[np.ix_(index, index)],
                 family.prior_mean[index],
                 family.prior_precision[index],
-                family.limits[:, [SIZE, PEAK]],
+                family.limits[:, SIZE],
             )
-            bend = along_bend(known, change)
+            bend = along_bend(known, table)
             at, least, most = self._felt(family.unit_kpa * np.append(contact[PEAK], bend.peaks))[0]
             sides[:, k] = np.array([at - least, most - at]) / ONE_SIDED_95
             edge = family.index[k, EDGE]
             if edge >= 0:  # a peak and an edge that rise together leave the force as it is
-                with_edge = np.outer(*[covariance[index, edge]] * 2) / covariance[edge, edge]
-                bend = along_bend(replace(known, covariance=known.covariance - with_edge), change)
+                along = covariance[index, edge]
+                at_edge = known.covariance - np.outer(along, along) / covariance[edge, edge]
+                bend = along_bend(replace(known, covariance=at_edge), table)
             forces[k] = bend.force_spread
         return sides, forces
 

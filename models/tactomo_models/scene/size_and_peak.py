@@ -9,7 +9,6 @@ prior stays as it is, and both weight points along the bend.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +17,6 @@ from tactomo_models.arrays import FloatArray
 
 ALONG, MAX_SIGMAS = 61, 6.0  # points along the bend, and how far
 ACROSS = np.linspace(-3, 3, 9)  # likewise across, in standard deviations
-PEAKS = 200  # of a table between the limits
 
 
 @dataclass(frozen=True)
@@ -29,7 +27,23 @@ class SizeAndPeak:
     covariance: FloatArray  # (2, 2) there, the prior included
     likely: FloatArray  # what is likely before any data
     precision: FloatArray  # inverse variances of that
-    limits: FloatArray  # (2, 2) least and largest
+    size_limits: FloatArray  # least and largest logarithm of size
+
+
+@dataclass(frozen=True)
+class ReflectionTable:
+    """How discs under peaks reflect a field."""
+
+    peaks: FloatArray  # (n,) between their limits
+    logarithm: FloatArray  # (n,) of the reflection
+    slope: FloatArray  # (n,) of that by the peak
+
+    @classmethod
+    def of(cls, peaks: FloatArray, relative_change: FloatArray) -> ReflectionTable:
+        """The table where the conductivity changes so (n,) under peaks (n,)."""
+        reflection = np.abs(relative_change / (2 + relative_change))
+        logarithm = np.log(np.maximum(reflection, 1e-9))
+        return cls(peaks, logarithm, np.gradient(logarithm, peaks))
 
 
 @dataclass(frozen=True)
@@ -40,18 +54,13 @@ class Bend:
     force_spread: float  # root mean square of the force's relative distance from the likeliest
 
 
-def along_bend(
-    known: SizeAndPeak,
-    # relative change of conductivity (n,) under peaks (n,)
-    relative_change: Callable[[FloatArray], FloatArray],
-) -> Bend:
+def along_bend(known: SizeAndPeak, table: ReflectionTable) -> Bend:
     """What a contact's peak and force may be."""
-    (least, lowest), (largest, highest) = known.limits
+    least, largest = known.size_limits
     size, peak = known.found
-    table = np.geomspace(lowest, highest, PEAKS)
-    reflection = _log_reflection(relative_change(table))
-    by_log = np.gradient(reflection, table)
-    at_found, slope = (float(np.interp(peak, table, each)) for each in (reflection, by_log))
+    at_found, slope = (
+        float(np.interp(peak, table.peaks, each)) for each in (table.logarithm, table.slope)
+    )
     certain = np.linalg.inv(known.covariance)
     data = certain - np.diag(known.precision)
     pull = known.precision * (known.found - known.likely)
@@ -60,20 +69,15 @@ def along_bend(
     by_size = np.expm1(2 * away) / 2  # to first order the change of size, of the radius squared
     by_peak = (ACROSS / np.sqrt(certain[1, 1])) - by_size * certain[0, 1] / certain[1, 1]
     wanted = at_found + slope * by_peak + 2 * (by_size - away)
-    peaks = np.interp(wanted, reflection, table)
+    peaks = np.interp(wanted, table.logarithm, table.peaks)
     cost = (data[0, 0] * by_size**2 + data[1, 1] * by_peak**2) / 2
     cost += data[0, 1] * by_size * by_peak - pull[0] * by_size - pull[1] * by_peak
     cost += known.precision[0] * (size + away - known.likely[0]) ** 2 / 2
     cost += known.precision[1] * (peaks - known.likely[1]) ** 2 / 2
-    width = 1 / np.maximum(np.interp(peaks, table, by_log), 1e-6)
+    width = 1 / np.maximum(np.interp(peaks, table.peaks, table.slope), 1e-6)
     share = np.exp(cost.min() - cost) * width
     share /= share.sum()
     order = np.argsort(peaks, axis=None)
     bounds = np.interp([0.05, 0.95], share.flat[order].cumsum(), peaks.flat[order])
     off = peaks / peak * np.exp(2 * away) - 1
     return Bend(np.asarray(bounds), float(np.sqrt((share * off**2).sum())))
-
-
-def _log_reflection(change: FloatArray) -> FloatArray:
-    """Logarithm of how a disc whose conductivity has changed so reflects a field, same shape."""
-    return np.log(np.maximum(np.abs(change / (2 + change)), 1e-9))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scene.pressure import ONE_SIDED_95
-from tactomo_models.scene.size_and_peak import SizeAndPeak, along_bend
+from tactomo_models.scene.size_and_peak import ReflectionTable, SizeAndPeak, along_bend
 
 PRIOR_SIGMA = np.array([0.6, 0.5])
 LIMITS = np.array([[np.log(0.003), 0.01], [np.log(0.1), 3.0]])
@@ -12,6 +12,10 @@ LIMITS = np.array([[np.log(0.003), 0.01], [np.log(0.1), 3.0]])
 
 def relative_change(peak: FloatArray) -> FloatArray:
     return 3.0 * peak / (1 + peak)
+
+
+PEAKS = np.geomspace(LIMITS[0, 1], LIMITS[1, 1], 200)
+TABLE = ReflectionTable.of(PEAKS, relative_change(PEAKS))
 
 
 def reflection(peak: FloatArray) -> FloatArray:
@@ -29,12 +33,12 @@ def known(size: float, peak: float, sigma: FloatArray) -> SizeAndPeak:
     precision = PRIOR_SIGMA**-2
     covariance = np.linalg.inv(certain + np.diag(precision))
     found = np.array([size, peak])
-    return SizeAndPeak(found, covariance, found, precision, LIMITS)
+    return SizeAndPeak(found, covariance, found, precision, LIMITS[:, 0])
 
 
 def test_what_data_tell_well_is_normal() -> None:
     each = known(np.log(0.012), 0.5, np.array([1e-3, 5e-3]))
-    bend = along_bend(each, relative_change)
+    bend = along_bend(each, TABLE)
     sigma = np.sqrt(each.covariance[1, 1])
     expected = 0.5 + np.array([-1, 1]) * ONE_SIDED_95 * sigma
     assert bend.peaks == pytest.approx(expected, abs=0.1 * sigma)
@@ -45,7 +49,7 @@ def test_a_size_that_data_hardly_tell_leaves_high_peaks_possible(size_mm: float)
     """The dipole is exact, the next term is a disc's of that size, to half of itself."""
     size, peak = np.log(size_mm / 1e3), 0.15
     each = known(size, peak, np.array([0.01, 0.5]))
-    bend = along_bend(each, relative_change)
+    bend = along_bend(each, TABLE)
     # The same without any coordinates along a bend: all sizes and peaks, each by its own voltages.
     sizes = np.linspace(LIMITS[0, 0], LIMITS[1, 0], 1500)[:, None]
     peaks = np.geomspace(LIMITS[0, 1], LIMITS[1, 1], 1500)
