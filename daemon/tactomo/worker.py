@@ -55,7 +55,7 @@ class Worker:
         """Whether the thread runs."""
         return self._thread.is_alive()
 
-    def _ask(self, work: Callable[[], Any]) -> Future[Any]:
+    def ask(self, work: Callable[[], Any]) -> Future[Any]:
         """Have the thread do something between its turns; for any thread, and never waits."""
         answer: Future[Any] = Future()
         self._asked.put((work, answer))

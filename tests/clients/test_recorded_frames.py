@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from frame_fields import frame_fields
 from tactomo.recordings.recording import Origin
-from tactomo.recordings.recording_writer import Entry, RecordingWriter, port_entry
+from tactomo.recordings.recording_writer import Entry, RecordingWriter
 from tactomo_client import Contact, Frame, MessageError, RecordingError, subscribe
 from tactomo_client.fake import FakeSensor
 from tactomo_client.messages import clock_id, encode_message
@@ -38,7 +38,7 @@ def entries(number: int, at_s: float) -> list[Entry]:
     as_map = encode_message("left", "map", fields | images | extent)
     as_contacts = encode_message("left", "contacts", fields)
     return [
-        port_entry(0, b"\0bytes\0", at_ns, at_ns),
+        Entry("port/0", b"\0bytes\0", at_ns, at_ns),
         Entry("map", as_map, at_ns, at_ns),
         Entry("contacts", as_contacts, at_ns, at_ns),
     ]

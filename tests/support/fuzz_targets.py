@@ -30,9 +30,7 @@ from tactomo.recordings.recording import Origin, open_recording
 from tactomo.recordings.recording_writer import (
     Entry,
     RecordingWriter,
-    frame_entry,
-    port_entry,
-    preamble_entry,
+    pack_frame,
     reference_entry,
 )
 from tactomo.scans import FrameRecord, ScanKey
@@ -230,15 +228,16 @@ def _recording_examples() -> list[bytes]:
     writer = RecordingWriter(path, Origin("left", "paper_square", "0" * 64, ("a", "b"), "0.1"))
     volts = np.linspace(0.05, 0.2, 6)
     reference = Reference(volts, volts, volts * 1e-4, None, scans=3)
-    writer.add(preamble_entry(0, encode(HELLO), 1, 1))
+    writer.add(Entry("port/0/hello", encode(HELLO), 1, 1))
     writer.add(reference_entry(reference, 1, 2, 2))
-    writer.add(port_entry(0, encode(SCAN), 3, 3))
-    writer.add(port_entry(1, b"\0\1\2", 4, 4))
+    writer.add(Entry("port/0", encode(SCAN), 3, 3))
+    writer.add(Entry("port/1", b"\0\1\2", 4, 4))
     contacts = encode_message("left", CONTACTS, {**HEADER, "contacts": [CONTACT]})
     writer.add(Entry(MAP, encode_message("left", MAP, HEADER), 4, 4))
     writer.add(Entry(CONTACTS, contacts, 4, 4))
     key = ScanKey(Channel.STRUCTURE, 7, 350_000)
-    writer.add(frame_entry(FrameRecord((key,), "fit", 4.0, reference_number=1), 5, 5))
+    mark = FrameRecord((key,), "fit", 4.0, reference_number=1)
+    writer.add(Entry("frame", pack_frame(mark), 5, 5))
     writer.flush()
     cut = path.read_bytes()
     writer.close()

@@ -22,7 +22,7 @@ from ezdxf.filemanagement import new
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 from tactomo.recordings.recording import Origin
-from tactomo.recordings.recording_writer import RecordingWriter, port_entry
+from tactomo.recordings.recording_writer import Entry, RecordingWriter
 from tactomo_models import SkinSimulator, load_description
 from tactomo_models.sensor.description_file import shipped_text
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag, encode
@@ -112,13 +112,13 @@ def beyond_recording(path: Path) -> None:
     kind = SampleFormat.FLOAT32
     hello = Hello("device", "firmware", both, 16, 1, 1, 208, kind, largest, 20.0)
     writer = RecordingWriter(path, Origin("skin", "paper_square", "", ("a",), "0"))
-    writer.add(port_entry(0, encode(hello), 10**10, 10**10))
+    writer.add(Entry("port/0", encode(hello), 10**10, 10**10))
     for counter in range(1, 60):
         at_ns = 10**10 + 50_000_000 * counter
         for channel in both:
             samples = np.full(208, largest * (-1) ** counter, np.float32)
             scan = Scan(channel, counter, 50_000 * counter, ScanFlag(0), samples)
-            writer.add(port_entry(0, encode(scan), at_ns, at_ns))
+            writer.add(Entry("port/0", encode(scan), at_ns, at_ns))
     writer.close()
 
 
@@ -170,7 +170,7 @@ def _recording(path: Path, origin: Origin, hellos: Iterable[Hello] = ()) -> None
     writer = RecordingWriter(path, origin)
     for number, hello in enumerate(hellos):
         at_ns = 10_000_000_000 + number
-        writer.add(port_entry(0, encode(hello), at_ns, at_ns))
+        writer.add(Entry("port/0", encode(hello), at_ns, at_ns))
     writer.close()
 
 
@@ -189,11 +189,11 @@ def timeless_recording(path: Path) -> None:
     """Scans of a computer whose clock stands still."""
     writer = RecordingWriter(path, Origin("skin", "paper_square", "", ("a",), "0"))
     at_ns, hello = 10_000_000_000, _hello("device")
-    writer.add(port_entry(0, encode(hello), at_ns, at_ns))
+    writer.add(Entry("port/0", encode(hello), at_ns, at_ns))
     for counter in (1, 2, 3):
         for channel in hello.channels:
             scan = Scan(channel, counter, 50_000 * counter, ScanFlag(0), np.ones(208, np.float32))
-            writer.add(port_entry(0, encode(scan), at_ns, at_ns))
+            writer.add(Entry("port/0", encode(scan), at_ns, at_ns))
     writer.close()
 
 

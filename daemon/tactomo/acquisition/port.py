@@ -37,7 +37,7 @@ from tactomo.acquisition.liveness import DeviceState, Liveness
 from tactomo.events import OnEvent, Rises, times
 from tactomo.protocols import PortProtocol, Trouble
 from tactomo.recordings.recorder import Recorder
-from tactomo.recordings.recording_writer import ActiveRecording, port_entry, preamble_entry
+from tactomo.recordings.recording_writer import ActiveRecording, Entry
 from tactomo.recordings.replay import Playback
 from tactomo.scans import ChannelScan, PortRead
 from tactomo.timing import wall_clock_ns
@@ -270,14 +270,14 @@ class PortReader(Worker):
         return self._recording
 
     def _record_to(self, active: ActiveRecording, data: bytes, times: tuple[int, int]) -> bool:
-        entries = [port_entry(self.index, data, *times)]
+        entries = [Entry(f"port/{self.index}", data, *times)]
         age_s = times[0] * 1e-9 - self._preamble_s
         if active.number != self._recording or age_s >= self.protocol.preamble_period_s:
             # So that its first scan is whole and what it means is known.
             preamble = self.protocol.preamble()
             self._preamble_s = times[0] * 1e-9
             if preamble:
-                entries.insert(0, preamble_entry(self.index, preamble, *times))
+                entries.insert(0, Entry(f"port/{self.index}/hello", preamble, *times))
         previous = None if active.come_over.is_set() else active.previous
         if previous is not None and self._recording in (previous.number, active.number):
             previous.add(entries[-1])

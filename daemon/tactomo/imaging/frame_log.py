@@ -17,8 +17,9 @@ from tactomo.imaging.kept_reference import KnownSkin
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording_writer import (
     ActiveRecording,
+    Entry,
     calibration_entry,
-    frame_entry,
+    pack_frame,
     reference_entry,
 )
 from tactomo.scans import DualScan, FrameRecord, Timing
@@ -78,7 +79,7 @@ class FrameLog:
             reference_number=recording.references or None,
             calibration_number=recording.calibrations,
         )
-        recording.add(frame_entry(done, time.monotonic_ns(), wall_clock_ns()))
+        recording.add(Entry("frame", pack_frame(done), time.monotonic_ns(), wall_clock_ns()))
 
     def _tell(self, recording: ActiveRecording, in_force: InForce) -> None:
         """Say reference and calibration, where they are new to the recording, or now and then."""

@@ -111,7 +111,7 @@ class KeptReference:
         about = {"description_sha256": sha256, "device_ids": np.array(devices, "U")}
         arrays |= {**about, "scans": now.scans, "realtime_ns": wall_clock_ns()}
         try:
-            self._recorder.do(lambda: self._write(arrays))
+            self._recorder.ask(lambda: self._write(arrays))
         except RecordingError as error:  # its thread has died, and that was told
             self._tell(error.cause)
 

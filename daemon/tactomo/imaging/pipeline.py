@@ -19,8 +19,6 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, Final
 
-from tactomo_models.calibration.calibration_file import PressureCalibration
-from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_protocol import Channel, Hello
 
 from tactomo.acquisition.scan_pairer import CounterPairer, RecordPairer, ScanPairer
@@ -185,35 +183,18 @@ class Pipeline(Worker):
                 "tare_refused",
             )
         answer: Future[Mapping[str, Any]] = Future()
-        self._ask(lambda: self._imaging.taring.start(answer))
+        self.ask(lambda: self._imaging.taring.start(answer))
         return answer
-
-    def set_method(self, method: str) -> Future[None]:
-        """Ask for a method; for any thread. The future is done when it is in force."""
-        return self._ask(lambda: self._imaging.method.request_method(method))
-
-    def set_budget(self, budget_ms: float | None) -> Future[None]:
-        """Ask for a time budget; for any thread. The future is done when it is in force."""
-        return self._ask(lambda: self._imaging.method.request_budget(budget_ms))
 
     def move(self, position_s: float) -> Future[dict[str, Any]]:
         """Have the replay go on elsewhere; for any thread. The future gets its fields then."""
-        return self._ask(lambda: self._move(position_s))
+        return self.ask(lambda: self._move(position_s))
 
     def step(self) -> None:
         """Have the replay go on by one dual scan; for any thread. The next may be here already."""
         assert self._replay is not None
         self._replay.playback.step()
         self._wake()
-
-    def use_calibration(
-        self, calibration: PressureCalibration | None, taught: TaughtSkin | None
-    ) -> Future[Mapping[str, Any]]:
-        """Ask for a pressure calibration and a teaching, None for neither; for any thread.
-
-        The future gets what is in force, or CommandError where one is another device's.
-        """
-        return self._ask(lambda: self._imaging.use_calibration(calibration, taught))
 
     def _run(self) -> None:
         self._begin()

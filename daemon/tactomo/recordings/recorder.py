@@ -81,9 +81,9 @@ class Recorder(Worker):
         super().start()
         if self._rules.file is not None:
             file = self._rules.file.absolute()
-            _wait_for(self._ask(lambda: self._begin(file, self._rules.maps)))
+            _wait_for(self.ask(lambda: self._begin(file, self._rules.maps)))
         elif self._rules.at_start:
-            _wait_for(self._ask(self._keep_recording))
+            _wait_for(self.ask(self._keep_recording))
 
     def begin(self, name: str | None, maps: bool | None = None) -> Future[Mapping[str, Any]]:
         """Ask for a recording into the folder: to a file of that name, or with None cut into files.
@@ -93,9 +93,7 @@ class Recorder(Worker):
         exists, is not in the folder or cannot be created, or the disk has no room.
         """
         with_maps = self._rules.maps if maps is None else maps
-        return self._ask(
-            lambda: self._begin(None if name is None else self._below(name), with_maps)
-        )
+        return self.ask(lambda: self._begin(None if name is None else self._below(name), with_maps))
 
     def end(self) -> Future[Mapping[str, Any]]:
         """Ask for the recording's end.
@@ -103,14 +101,7 @@ class Recorder(Worker):
         The future gets `path` and length in `bytes` of the file, the last one of a set; or
         CommandError where none runs, or RecordingError where it could not be written to its end.
         """
-        return self._ask(self._end)
-
-    def do(self, work: Callable[[], None]) -> None:
-        """Have other work with files done by the thread that may wait for disks.
-
-        Raises RecordingError where the thread has died.
-        """
-        self._ask(work)
+        return self.ask(self._end)
 
     def set_calibration(self, text: str) -> None:
         """Have the files to come tell this pressure calibration; for the pipeline's thread."""
@@ -146,10 +137,14 @@ class Recorder(Worker):
         else:
             self._on_event("recording_resumed", "the disk answers again")
 
-    def _ask(self, work: Callable[[], Any]) -> Future[Any]:
+    def ask(self, work: Callable[[], Any]) -> Future[Any]:
+        """See `Worker`: work with files, for which this thread may wait.
+
+        Raises RecordingError where the thread has died.
+        """
         if self._is_dead:
             raise RecordingError(_DIED, _REPORT, "cannot_write")
-        return super()._ask(lambda: _answered(work))
+        return super().ask(lambda: _answered(work))
 
     def _wake(self) -> None:
         self._woken.set()

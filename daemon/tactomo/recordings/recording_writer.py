@@ -48,16 +48,6 @@ class Entry(NamedTuple):
     realtime_ns: int
 
 
-def port_entry(port: int, data: bytes, monotonic_ns: int, realtime_ns: int) -> Entry:
-    """What one read of a port returned, with its times."""
-    return Entry(f"port/{port}", data, monotonic_ns, realtime_ns)
-
-
-def preamble_entry(port: int, data: bytes, monotonic_ns: int, realtime_ns: int) -> Entry:
-    """What a port's protocol needs to know of what came before the recording."""
-    return Entry(f"port/{port}/hello", data, monotonic_ns, realtime_ns)
-
-
 def reference_entry(
     reference: Reference, number: int, monotonic_ns: int, realtime_ns: int
 ) -> Entry:
@@ -78,13 +68,8 @@ def calibration_entry(text: str, number: int, monotonic_ns: int, realtime_ns: in
     return Entry("calibration", data, monotonic_ns, realtime_ns)
 
 
-def frame_entry(mark: FrameRecord, monotonic_ns: int, realtime_ns: int) -> Entry:
-    """A dual scan that was reconstructed; a new reference is an entry of its own, before it."""
-    return Entry("frame", pack_frame(mark), monotonic_ns, realtime_ns)
-
-
 def pack_frame(mark: FrameRecord) -> bytes:
-    """Return a mark as it is written."""
+    """Return a mark as it is written; a new reference is an entry of its own, before it."""
     fields = {
         "scans": [(key.channel.number, key.counter, key.device_us) for key in mark.scans],
         "tier": mark.tier,
@@ -298,7 +283,7 @@ def write_recording(
             if time_s - hello_at_s >= HELLO_PERIOD_S:
                 data, hello_at_s = encode(hello) + data, time_s
             after_ns = round(time_s * 1e9)
-            writer.add(port_entry(0, data, monotonic_ns + after_ns, realtime_ns + after_ns))
+            writer.add(Entry("port/0", data, monotonic_ns + after_ns, realtime_ns + after_ns))
         return writer.close()
     except OSError as error:
         writer.abandon()

@@ -41,7 +41,8 @@ class Playback:
     maps_before = 0  # how many maps were published before this pass
     loops = False  # whether the end is followed by the beginning
     waits_for_page = False  # whether it is paused until somebody looks
-    _is_paused = _is_stepping = False
+    is_paused = False  # whether it goes on by steps alone, of which every dual scan is to be shown
+    _is_stepping = False
 
     def __post_init__(self) -> None:
         self.begin_ns = self.start_ns  # of this pass
@@ -51,13 +52,8 @@ class Playback:
         self._changed = threading.Condition(threading.RLock())
 
     @property
-    def is_paused(self) -> bool:
-        """Whether it goes on by steps alone, of which every dual scan is to be shown."""
-        return self._is_paused
-
-    @property
     def _stands(self) -> bool:
-        return self._is_paused and not self._is_stepping
+        return self.is_paused and not self._is_stepping
 
     @property
     def position_ns(self) -> int:
@@ -109,7 +105,7 @@ class Playback:
         with self._changed:
             self._settle()
             if paused is not None:
-                self._is_paused, self._is_stepping, self.waits_for_page = paused, False, False
+                self.is_paused, self._is_stepping, self.waits_for_page = paused, False, False
             self._speed = self._speed if speed is None else speed
             self.loops = self.loops if loop is None else loop
             self.steered_ns = time.monotonic_ns()
@@ -119,7 +115,7 @@ class Playback:
         """Go on, paced, until a dual scan is let through."""
         with self._changed:
             self._settle()
-            self._is_paused = self._is_stepping = True
+            self.is_paused = self._is_stepping = True
             self.waits_for_page = False
             self._changed.notify_all()
 
@@ -141,7 +137,7 @@ class Playback:
             ahead_ns = min(position_s * 1e9, self._last_ns - self.start_ns)
             self.begin_ns = self._position_ns = self.start_ns + round(ahead_ns)
             self._since_ns = None
-            self._is_stepping = self._is_paused
+            self._is_stepping = self.is_paused
             self.passes += 1
             self._changed.notify_all()
             return self.fields()

@@ -414,11 +414,13 @@ class Daemon:
         except ModelError as error:
             name = "no_network" if isinstance(error, ArtifactError) else "bad_argument"
             raise CommandError(str(error), name=name) from error
-        return Settling({"tier": method}, self._pipeline.set_method(method))
+        in_force = self._pipeline.ask(lambda: self._imaging.method.request_method(method))
+        return Settling({"tier": method}, in_force)
 
     def _set_budget(self, arguments: SetBudget) -> Settling:
         budget_ms = arguments.budget_ms
-        return Settling({"budget_ms": budget_ms}, self._pipeline.set_budget(budget_ms))
+        in_force = self._pipeline.ask(lambda: self._imaging.method.request_budget(budget_ms))
+        return Settling({"budget_ms": budget_ms}, in_force)
 
     def _steer_replay(self, arguments: SteerReplay) -> Outcome:
         playback = self.playback
@@ -459,7 +461,7 @@ class Daemon:
             step = "what was in force stays so"
             self._on_event("calibration_refused", unused[0], step)
             raise CommandError(unused[0], step, "calibration_refused")
-        return self._pipeline.use_calibration(found, taught)
+        return self._pipeline.ask(lambda: self._imaging.use_calibration(found, taught))
 
     def _zero_counters(self) -> None:
         for port in self._ports:

@@ -19,11 +19,10 @@ from mcap.reader import make_reader
 from tactomo.errors import RecordingError
 from tactomo.recordings.recording import Origin, open_recording
 from tactomo.recordings.recording_writer import (
+    Entry,
     RecordingWriter,
     calibration_entry,
-    frame_entry,
-    port_entry,
-    preamble_entry,
+    pack_frame,
     reference_entry,
 )
 from tactomo.recordings.recovery import Recovery, recover
@@ -58,7 +57,7 @@ def write(path: Path) -> None:
     rest = np.linspace(0.05, 0.2, 208)
     reference = Reference.from_scans(np.stack([rest, rest * 1.0001]), None)
     writer = RecordingWriter(path, ORIGIN)
-    writer.add(preamble_entry(0, encode(HELLO), 0, 0))
+    writer.add(Entry("port/0/hello", encode(HELLO), 0, 0))
     references = 0
     for counter in range(SCANS):
         time_ns = counter * PERIOD_NS
@@ -69,13 +68,13 @@ def write(path: Path) -> None:
             writer.add(calibration_entry("another", 1, time_ns, time_ns))
         packets = [scan(channel, counter) for channel in Channel]
         data = b"".join(encode(packet) for packet in packets)
-        writer.add(port_entry(0, data, time_ns, time_ns))
+        writer.add(Entry("port/0", data, time_ns, time_ns))
         keys = tuple(ScanKey(p.channel, p.counter, p.device_us) for p in packets)
         calibrations = int(counter >= RECALIBRATED)
         mark = FrameRecord(
             keys, "auto", None, reference_number=references, calibration_number=calibrations
         )
-        writer.add(frame_entry(mark, time_ns, time_ns))
+        writer.add(Entry("frame", pack_frame(mark), time_ns, time_ns))
         if counter % A_CHUNK == A_CHUNK - 1:
             writer.flush()
     writer.close()
