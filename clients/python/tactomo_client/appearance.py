@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactomo_client.schema import Contact, Frame
+from tactomo_client.schema import Companion, Contact, Frame
 
 # Dark to bright, as perceived brightness: black, violet, red, orange, yellow, white.
 COLOURS: Final = ((0, 0, 4), (87, 16, 110), (188, 55, 84), (249, 142, 9), (252, 255, 164))
@@ -59,13 +59,13 @@ def colours(level: NDArray[Any]) -> NDArray[np.float64]:
     return np.stack([np.interp(level, knots, channel) for channel in palette.T], axis=-1)
 
 
-def companion_words(companion: Mapping[str, Any]) -> str:
-    """Return what a companion reads, and whether it is believed, of an entry of `companions`."""
-    read = [companion[key] for key in ("reading", "force_n", "force_sigma_n")]
-    believed = COMPANION_STATES.get(companion["state"], str(companion["state"]))
-    if None in read:
+def companion_words(companion: Companion) -> str:
+    """Return what a companion reads, and whether it is believed."""
+    believed = COMPANION_STATES.get(companion.state, companion.state)
+    reading, force_n, sigma_n = companion.reading, companion.force_n, companion.force_sigma_n
+    if reading is None or force_n is None or sigma_n is None:
         return believed
-    return f"reads {read[0]:g}: {read[1]:z.1f} ± {read[2]:.1f} N, {believed}"
+    return f"reads {reading:g}: {force_n:z.1f} ± {sigma_n:.1f} N, {believed}"
 
 
 def shown_image(

@@ -210,8 +210,7 @@ class Browser:
             await self._send("twin", **twin)
         status = self._feed.status
         if status is not None and self._is_new(status):
-            read = status.companions.items()
-            words = {name: companion_words(dataclasses.asdict(each)) for name, each in read}
+            words = {name: companion_words(each) for name, each in status.companions.items()}
             fields = {**status.fields, "companion_words": words}
             await self._send("status", age_ms=status.age_s * 1e3, status=fields)
         for heard in [e for e in self._feed.events if e.number > self._last_event]:

@@ -190,7 +190,8 @@ def test_what_is_lost_is_told_by_counts_of_the_last_minute(tactomo: Run, control
 
 def test_a_replay_sends_nobody_to_a_cable_that_is_not_there(tactomo: Run, control: Any) -> None:
     losses = {"frames": 600, "dropped_scans": 150, "incomplete_scans": 600}
-    control.answers["status"] = {**STATUS, "replay": {"exact": True}, "last_minute": losses}
+    replay = {"position_s": 1.0, "duration_s": 9.0, "speed": 1.0, "exact": True}
+    control.answers["status"] = {**STATUS, "replay": replay, "last_minute": losses}
     judge(control)
     shown = tactomo("status").stdout
     assert "so it was recorded" in shown

@@ -83,18 +83,19 @@ def read_robot_log(path: Path) -> RobotLog:
         raise TactomoError(f"{path}: its lines are not {len(names)} numbers, one a name", step)
     times_s = rows[:, names.index(clock)]
     episodes = rows[:, names.index(EPISODE)] if EPISODE in names else np.zeros(len(rows))
-    _refuse(path, ~np.isfinite(rows).all(axis=1), "a value is not a finite number", "correct it")
+    odd = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    _refuse(path, odd, "a value is not a finite number", "correct it")
     step = "give the steps in the order of their times; monotonic_s never jumps"
-    is_back = np.diff(times_s, prepend=-np.inf) <= 0
-    _refuse(path, is_back, f"{clock} is not later than in the line before", step)
+    back = np.flatnonzero(np.diff(times_s) <= 0) + 1
+    _refuse(path, back, f"{clock} is not later than in the line before", step)
     rest = [i for i, name in enumerate(names) if name not in (*CLOCKS, EPISODE)]
     return RobotLog(clock, times_s, episodes, tuple(names[i] for i in rest), rows[:, rest])
 
 
-def _refuse(path: Path, is_wrong: NDArray[np.bool_], cause: str, step: str) -> None:
-    """Raise TactomoError for the first row of a log that is wrong; the line of names is line 1."""
-    if is_wrong.any():
-        raise TactomoError(f"{path}, line {is_wrong.argmax() + 2}: {cause}", step)
+def _refuse(path: Path, rows: NDArray[np.intp], cause: str, step: str) -> None:
+    """Raise TactomoError for the first of these rows, if any; the line of names is line 1."""
+    if len(rows):
+        raise TactomoError(f"{path}, line {rows[0] + 2}: {cause}", step)
 
 
 DEFAULT_FPS: Final = 30  # as LeRobot's own programs have it

@@ -16,7 +16,16 @@ from tactomo.errors import TactomoError
 from tactomo.plain import counted, plain
 
 if TYPE_CHECKING:
-    from tactomo_client import Daemon, RecordedFile
+    from tactomo_client import Daemon, RecordedFile, Status
+    from tactomo_client.schema import (
+        Baseline,
+        EventCounts,
+        Percentiles,
+        Port,
+        Process,
+        SensorDescription,
+        Trouble,
+    )
 
 SOON_S = 3.0
 START_S = 60.0  # in which a daemon builds its models and takes a reference
@@ -287,21 +296,24 @@ def status(
     if as_json:
         print_json(answer)
         return
-    for line in lines_of(_plain(answer)):
+    for line in lines_of(answer):
         typer.echo(line)
 
 
-def lines_of(status: dict[str, Any]) -> list[str]:
+def lines_of(answer: Mapping[str, Any]) -> list[str]:
     """Return what is printed of a status.
 
     Raises TactomoError where another program, or another version, made it of other types.
     """
+    from tactomo_client.control import to_status
+
     lines = []
     with of_this_version():
-        for issue in status.get("issues") or []:
-            colour = "red" if issue["severity"] == "error" else "yellow"
-            lines += [typer.style(issue["what"], fg=colour, bold=True), f"    {issue['next_step']}"]
-        lines.append(f"{status['sensor']}: {_words(status['state'])}")
+        status = to_status(_plain(answer))
+        for issue in status.issues:
+            colour = "red" if issue.severity == "error" else "yellow"
+            lines += [typer.style(issue.what, fg=colour, bold=True), f"    {issue.next_step}"]
+        lines.append(f"{status.sensor}: {_words(status.state)}")
         rows = _rows(status)
     return lines + [f"{typer.style(f'{name:<13} ', bold=True)}{value}" for name, value in rows]
 
@@ -315,105 +327,88 @@ def _plain(told: Any) -> Any:
     return plain(told) if isinstance(told, str) else told
 
 
-def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
+def _rows(status: Status) -> list[tuple[str, str]]:
     from tactomo_client.appearance import companion_words
+    from tactomo_client.schema import SensorDescription
 
-    rates = status.get("rates") or {}
-    latency = status.get("latency_ms") or {}
-    recording = status.get("recording")
-    reference = status.get("reference") or {}
-    description = status.get("description") or {}
-    rows = [
-        ("daemon", f"{status.get('version')}, up {status.get('uptime_s', 0.0):.0f} s"),
-        ("sensor", f"{description.get('model')} ({', '.join(description.get('modalities', []))})"),
+    description = status.description or SensorDescription()
+    recording, reference, rates = status.recording, status.reference, status.rates
+    scan_rates = (
+        f"{channel} {_number(getattr(rates, f'{channel}_hz', None))}"
+        for channel in description.modalities
+    )
+    return [
+        ("daemon", f"{status.version}, up {status.uptime_s:.0f} s"),
+        ("sensor", f"{description.model} ({', '.join(description.modalities)})"),
         ("pressure", _pressure(description)),
-        ("source", str((status.get("source") or {}).get("kind"))),
-        *(("port", _port_line(port)) for port in status.get("ports", [])),
-        (
-            "rates",
-            f"{_number(rates.get('frames_hz'))} frames/s; scans/s: "
-            + ", ".join(
-                f"{channel} {_number(rates.get(f'{channel}_hz'))}"
-                for channel in description.get("modalities", [])
-            ),
-        ),
-        ("latency", _percentiles(latency)),
-        *(
-            (f"  {stage}", _percentiles(times))
-            for stage, times in (status.get("stage_ms") or {}).items()
-        ),
-        (
-            "method",
-            f"{status.get('tier_requested')}; the newest frame by {status.get('tier') or '-'}",
-        ),
-        ("  methods", ", ".join(status.get("methods") or []) or "-"),
-        ("budget", _budget(status.get("budget_ms"), status.get("plan") or {})),
-        ("flags", "; ".join(map(_flag, status.get("flags", []))) or "none"),
-        ("misfit", _misfit(status.get("misfit"))),
+        ("source", status.source.kind),
+        *(("port", _port_line(port)) for port in status.ports),
+        ("rates", f"{_number(rates.frames_hz)} frames/s; scans/s: {', '.join(scan_rates)}"),
+        ("latency", _percentiles(status.latency_ms)),
+        *((f"  {stage}", _percentiles(times)) for stage, times in status.stage_ms.items()),
+        ("method", f"{status.tier_requested}; the newest frame by {status.tier or '-'}"),
+        ("  methods", ", ".join(status.methods) or "-"),
+        ("budget", _budget(status.budget_ms, status.plan.share)),
+        ("flags", "; ".join(map(_flag, sorted(status.flags))) or "none"),
+        ("misfit", _misfit(status.misfit)),
         (
             "lost",
-            f"{counted(status.get('dropped_scans', 0), 'dual scan')} dropped and "
-            f"{status.get('incomplete_scans', 0)} incomplete since the start, "
-            f"{counted(status.get('frames', 0), 'frame')} made",
+            f"{counted(status.dropped_scans, 'dual scan')} dropped and "
+            f"{status.incomplete_scans} incomplete since the start, "
+            f"{counted(status.frames, 'frame')} made",
         ),
-        ("reference", counted(reference["scans"], "dual scan") if reference else "none yet"),
-        ("baseline", _baseline(status.get("baseline") or {})),
-        *(
-            ("companion", f"{name} {companion_words(each)}")
-            for name, each in (status.get("companions") or {}).items()
-        ),
-        ("recording", f"{recording['path']} ({_mb(recording['bytes'])})" if recording else "off"),
-        ("subscribers", str(status.get("subscribers", "-"))),
-        ("events", _events(status.get("events") or {})),
-        *(("  last", _trouble(each)) for each in (status.get("events") or {}).get("troubles", [])),
-        ("process", _process(status.get("process") or {}, status.get("uptime_s") or 0.0)),
+        ("reference", counted(reference.scans, "dual scan") if reference else "none yet"),
+        ("baseline", _baseline(status.baseline)),
+        *(("companion", f"{k} {companion_words(each)}") for k, each in status.companions.items()),
+        ("recording", f"{recording.path} ({_mb(recording.bytes)})" if recording else "off"),
+        ("subscribers", str(status.subscribers)),
+        ("events", _events(status.events)),
+        *(("  last", _trouble(each)) for each in status.events.troubles),
+        ("process", _process(status.process, status.uptime_s) if status.process else "-"),
     ]
-    return rows
 
 
-def _pressure(description: dict[str, Any]) -> str:
+def _pressure(description: SensorDescription) -> str:
     """Say what turns a change into a pressure."""
-    calibration = description.get("calibration")
-    if calibration:
-        low, high = calibration["range_kpa"]
+    if calibration := description.calibration:
+        low, high = calibration.range_kpa
         return (
-            f"calibrated {calibration['taken'][:10]} by {calibration['readings']} readings: "
-            f"{low:.0f} to {high:.0f} kPa ± {calibration['sigma_kpa']:.1f}"
+            f"calibrated {calibration.taken[:10]} by {calibration.readings} readings: "
+            f"{low:.0f} to {high:.0f} kPa ± {calibration.sigma_kpa:.1f}"
         )
-    if description.get("pressure_max_kpa") is None:
+    if description.pressure_max_kpa is None:
         return "none: no magnitude channel"
     return "by the description's table; `tactomo calibrate` makes it this sensor's"
 
 
-def _baseline(baseline: dict[str, Any]) -> str:
+def _baseline(baseline: Baseline) -> str:
     """Say whether the reference follows drift, and how far it has gone since the tare."""
-    state, refusal = str(baseline.get("state") or "-"), baseline.get("refusal")
+    state, refusal = baseline.state, baseline.refusal
     gone = [
-        f"{channel} drifted by {drift['gain']:+.2%}, unevenly by {drift['uneven']:.2%}"
-        for channel, drift in (baseline.get("drift") or {}).items()
+        f"{channel} drifted by {drift.gain:+.2%}, unevenly by {drift.uneven:.2%}"
+        for channel, drift in baseline.drift.items()
     ]
     return "; ".join([f"{_warn(state)}: {refusal}" if refusal else state, *gone])
 
 
-def _events(events: dict[str, Any]) -> str:
+def _events(events: EventCounts) -> str:
     from tactomo.events import times
 
-    counts = events.get("counts") or {}
-    told = (f"{_words(name)} {times(count)}" for name, count in sorted(counts.items()))
+    told = (f"{_words(name)} {times(count)}" for name, count in sorted(events.counts.items()))
     return ", ".join(told) or "none"
 
 
-def _trouble(trouble: dict[str, Any]) -> str:
-    age_s = trouble.get("age_s") or 0.0
+def _trouble(trouble: Trouble) -> str:
+    age_s = trouble.age_s or 0.0
     ago = f"{age_s:.0f} s" if age_s < 120 else f"{age_s / 60:.0f} min"
-    return f"{_warn(_words(trouble.get('name')))}, {ago} ago: {trouble.get('detail')}"
+    return f"{_warn(_words(trouble.name))}, {ago} ago: {trouble.detail}"
 
 
-def _process(process: dict[str, Any], uptime_s: float) -> str:
-    share = 1e2 * (process.get("cpu_s") or 0.0) / max(uptime_s, 1.0)
+def _process(process: Process, uptime_s: float) -> str:
+    share = 1e2 * process.cpu_s / max(uptime_s, 1.0)
     return (
-        f"pid {process.get('pid', '-')}, {share:.1f} % of a core on average, "
-        f"{_mb(process.get('memory_bytes'))}, {process.get('threads', '-')} threads"
+        f"pid {process.pid}, {share:.1f} % of a core on average, "
+        f"{_mb(process.memory_bytes)}, {process.threads} threads"
     )
 
 
@@ -421,25 +416,23 @@ def _mb(size_bytes: float | None) -> str:
     return "-" if size_bytes is None else f"{size_bytes / 1e6:.1f} MB"
 
 
-def _port_line(port: dict[str, Any]) -> str:
-    device = port.get("device") or {}
+def _port_line(port: Port) -> str:
+    device_id = port.device.device_id if port.device else "no device has answered yet"
+    channels = port.device.channels if port.device else ()
     return (
-        f"{port.get('url')} ({port.get('state', '-')}), "
-        f"{device.get('device_id', 'no device has answered yet')}, "
-        f"{', '.join(device.get('channels', [])) or '-'}; {port.get('packets', 0)} packets, "
-        f"{port.get('corrupt', 0)} corrupt"
+        f"{port.url} ({port.state or '-'}), {device_id}, {', '.join(channels) or '-'}; "
+        f"{port.packets} packets, {port.corrupt} corrupt"
     )
 
 
-def _budget(budget_ms: float | None, plan: dict[str, Any]) -> str:
+def _budget(budget_ms: float | None, share: float) -> str:
     """Say how much work a frame may take."""
-    share = plan.get("share", 1.0)
     left = f", {share:.0%} of it while other programs use the processor" if share < 1 else ""
     return ("the method's own" if budget_ms is None else f"{budget_ms:g} ms of work") + left
 
 
-def _percentiles(times: dict[str, Any]) -> str:
-    return f"p50 {_number(times.get('p50'))} ms, p99 {_number(times.get('p99'))} ms"
+def _percentiles(times: Percentiles | None) -> str:
+    return "-" if times is None else f"p50 {times.p50:.2f} ms, p99 {times.p99:.2f} ms"
 
 
 def _number(value: float | None) -> str:
@@ -458,9 +451,9 @@ def _flag(name: str) -> str:
     return f"{name}: {FLAG_ADVICE[name][0]}" if name in FLAG_ADVICE else name
 
 
-def _words(name: object) -> str:
-    return str(name).replace("_", " ")
+def _words(name: str) -> str:
+    return name.replace("_", " ")
 
 
-def _warn(text: object) -> str:
-    return typer.style(str(text), fg="yellow")
+def _warn(text: str) -> str:
+    return typer.style(text, fg="yellow")

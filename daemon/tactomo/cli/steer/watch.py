@@ -244,7 +244,7 @@ def _health(view: View, frame: Frame) -> RenderableType:
 
     status = view.status
     latency = status and status.latency_ms
-    companions = (status.fields.get("companions") or {}) if status else {}
+    companions = status.companions if status else {}
     rows = {
         "rate": f"{status.rates.frames_hz:.1f} frames/s" if status else "-",
         "latency": f"{latency.p50:.1f} ms (p99 {latency.p99:.1f})" if latency else "-",
