@@ -1,7 +1,8 @@
 """The `tactomo` command: what runs it, and how its errors are printed.
 
-`tactomo.cli.commands` lists the commands. Everything heavy is imported inside the command that
-needs it, so that `tactomo --help` and `tactomo status` answer at once.
+`tactomo.cli.commands` lists the commands, whose modules are imported when they are called. What is
+heavy is imported inside the functions that need it, so that `tactomo status` and each `--help`
+answer at once.
 """
 
 from __future__ import annotations

@@ -19,14 +19,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.table import Table
+from tactomo_client import Frame, Subscription, request, subscribe
 
 from tactomo.cli import options
+from tactomo.cli.children import new_group
 from tactomo.cli.commands import measurement
+from tactomo.cli.console import Console, page
 from tactomo.cli.output import print_json, table
 
 if TYPE_CHECKING:
-    from rich.table import Table
-    from tactomo_client import Frame, Subscription
     from tactomo_models import SensorDescription
 
 SENSOR = "bench"
@@ -125,8 +127,6 @@ def bench(
         measure = measurement("chart")
         results.chart = measure(description, chart, count, results.machine, method or [])
     else:
-        from tactomo.cli.console import Console
-
         with Console(stderr=True).status("starting") as line:
             _measure_twin(results, rate, seconds, line.update)
     if as_json:
@@ -138,10 +138,7 @@ def bench(
 def _measure_twin(
     results: Results, rate: float, seconds: float, report: Callable[[str], None]
 ) -> None:
-    from tactomo_client import request, subscribe
     from tactomo_models import load_description
-
-    from tactomo.cli.children import new_group
 
     with tempfile.TemporaryDirectory(prefix="tactomo-") as folder, new_group() as group:
 
@@ -195,7 +192,6 @@ def _measure(
     moves: Callable[[float], None] | None,  # gets the share of the time that has passed
 ) -> Phase:
     import numpy as np
-    from tactomo_client import request
 
     ages_ms: list[float] = []
     tiers: Counter[str] = Counter()
@@ -236,8 +232,6 @@ def _spot(description: SensorDescription, place: tuple[float, float]) -> tuple[f
 
 def _print(results: Results) -> None:
     """Print on what everything was measured, and what came out."""
-    from tactomo.cli.console import page
-
     console = page()
     console.print(f"{results.machine}, sensor {results.description}")
     console.print(_live_table(results))

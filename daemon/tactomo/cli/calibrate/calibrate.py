@@ -11,16 +11,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
+from rich.table import Table
+from tactomo_client import CalibrationInForce, CalibrationRefused, ClientError, Daemon, KeysError
+from tactomo_client.control import to_status
 
 from tactomo.cli import options
+from tactomo.cli.console import Console
 from tactomo.cli.output import say, table
 from tactomo.cli.plot.plot import picture_option, save_figure
 from tactomo.cli.sensors import SensorError, find_commanded, find_sensor, name_of, newest_status
 from tactomo.plain import plain
 
 if TYPE_CHECKING:
-    from rich.table import Table
-    from tactomo_client import CalibrationInForce
     from tactomo_models.calibration.calibration_file import (
         Kept,
         KeptFiles,
@@ -82,7 +84,6 @@ def live(
     reading, and says when there are enough readings. Ctrl-C keeps the readings; the same command
     continues later, until you delete the file of readings that it names.
     """
-    from tactomo_client.control import to_status
     from tactomo_models.calibration.calibration_file import CALIBRATIONS
 
     from tactomo.cli.calibrate.live import guided
@@ -212,8 +213,6 @@ def _draw(made: PressureCalibration, picture: Path | None) -> None:
 
 def print_calibration(made: PressureCalibration) -> None:
     """Print a calibration: what it rests on, and the curve with its uncertainty."""
-    from tactomo.cli.console import Console
-
     console = Console()
     console.print(f"{made.subject.sensor}: {made.words}", soft_wrap=True, highlight=False)
     console.print(_table(made))
@@ -324,8 +323,6 @@ def taken_up(
     files: KeptFiles[Made], made: Made, path: Path, address: str | None, keys: Path | None
 ) -> str:
     """Have the sensor's daemon, if it runs, use what was kept; say in words what became of it."""
-    from tactomo_client import CalibrationRefused, ClientError, KeysError
-
     sensor = made.subject.sensor
     own = files.path(sensor)
     again = f"tactomo calibrate reload --sensor {sensor}"
@@ -352,8 +349,6 @@ def taken_up(
 
 
 def _reloaded(control: str, keys: Path | None) -> CalibrationInForce:
-    from tactomo_client import Daemon
-
     with Daemon(control, keys=keys, connect_timeout_s=CONNECT_S) as daemon:
         return daemon.reload_calibration()
 

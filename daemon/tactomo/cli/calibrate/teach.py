@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tactomo.cli import options
+from tactomo.cli.calibrate.calibrate import keep
 from tactomo.cli.output import progress_bar, say
 from tactomo.cli.sensors import find_sensor, name_of
 
@@ -133,8 +134,6 @@ def _teach(
     """Learn from a file, keep what is learnt in `path`, if any, and have the daemon use it."""
     from tactomo_models.calibration.taught_skin import TAUGHT
     from tactomo_models.commissioning.teach import read_presses, teach
-
-    from tactomo.cli.calibrate.calibrate import keep
 
     with progress_bar("reconstructing presses") as show:
         known = read_presses(presses, description)

@@ -10,11 +10,14 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import zmq
 from numpy.typing import NDArray
 from tactomo_client import Keys
+from tactomo_client.connection import Connection, connect_subscriber
+from tactomo_client.messages import MAP, SCAN, STATUS, array_from_wire, topic
 from tactomo_client.schema import STALE_AFTER_S
 from tactomo_models import DescriptionError, load_description
 from tactomo_models.array_files import NUMBERS, bounded
@@ -38,9 +41,6 @@ from tactomo.service.health_issues import (
     FEWEST_INCOMPLETE,
     FIRMWARE_STEP,
 )
-
-if TYPE_CHECKING:
-    from tactomo_client.connection import Connection
 
 CHANGES = "dv"
 ISSUE_LEVELS = {"error": Level.FAULT, "warning": Level.ADVICE}
@@ -91,10 +91,6 @@ def of_daemon(
     progress: Callable[[float], None],
 ) -> Evidence:
     """Listen to a daemon; raise TactomoError where none answers, or it has no scans."""
-    import zmq
-    from tactomo_client.connection import connect_subscriber
-    from tactomo_client.messages import MAP, SCAN, STATUS, topic
-
     said: dict[str, list[dict[str, Any]]] = {MAP: [], SCAN: [], STATUS: []}
     socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
     connection = connect_subscriber(socket, stream, [topic(sensor, k) for k in said], keys=keys)
@@ -181,8 +177,6 @@ def _layout_of_status(
 
 
 def _scans_of_messages(messages: list[dict[str, Any]]) -> dict[str, Scans]:
-    from tactomo_client.messages import array_from_wire
-
     scans = {}
     for channel in Channel:
         there = [m for m in messages if m[channel] is not None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,10 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli.commands import Group
+from tactomo.cli.console import Console
 from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, examples, typer_app
 from tactomo.cli.output import say
 from tactomo.cli.plot.electrodes import draw_electrodes, outline_path, outwards
 from tactomo.cli.plot.plot import prepare_picture, save_figure
+from tactomo.errors import TactomoError, needs, os_errors_as
 from tactomo.plain import counted, plain
 
 if TYPE_CHECKING:
@@ -46,8 +49,6 @@ def build(description: Description = DEFAULT_DESCRIPTION) -> None:
         save_artifact,
     )
 
-    from tactomo.cli.console import Console
-
     sensor = load_description(description)
     path = default_path(sensor)
     try:
@@ -75,8 +76,6 @@ def copy(
 
 
 def _write_new(path: Path, text: str) -> None:
-    from tactomo.errors import TactomoError, os_errors_as
-
     step = "give the path of a new file"
     with (
         os_errors_as(TactomoError, f"cannot write {path}", step),
@@ -125,13 +124,9 @@ def import_model(
     needs svgelements: `pip install 'tactomo[drawings]'`. An EIDORS model is a .mat of fwd_model.
     Of pyEIT, save node, element, el_pos, ex_mat and meas_mat by `numpy.savez`.
     """
-    import re
-
     from tactomo_models.imported.drawing import read_drawing
     from tactomo_models.imported.mesh import read_model
     from tactomo_models.imported.model import describe, evenly_placed
-
-    from tactomo.errors import TactomoError, needs, os_errors_as
 
     read_step = "give a .dxf, .svg, .mat or .npz file"
     is_drawing = source.suffix.lower() in (".dxf", ".svg")
@@ -215,8 +210,6 @@ def draw(
     from tactomo_models import load_description
     from tactomo_models.physics.artifact import load_or_build_artifact
     from tactomo_models.physics.sensitivity import find_visibility
-
-    from tactomo.cli.console import Console
 
     description = load_description(sensor)
     picture = output or Path(f"{description.name}.png")

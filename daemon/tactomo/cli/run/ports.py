@@ -10,13 +10,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tactomo.acquisition.adapters import (
+    LOW_LATENCY_MS,
+    Adapter,
+    Holder,
+    lasting_name,
+    list_adapters,
+    look_alikes,
+    modem_manager_runs,
+)
+from tactomo.acquisition.open_serial import how_to_grant, other_holders
 from tactomo.cli.options import JsonOutput, examples, typer_app
 from tactomo.cli.output import print_json, say
 
 if TYPE_CHECKING:
     from tactomo_protocol import Hello
-
-    from tactomo.acquisition.adapters import Adapter, Holder
 
 
 NONE_THERE = """no USB adapter is there
@@ -88,8 +96,6 @@ class Row:
 
 def survey(paths: Sequence[str], root: Path = Path("/")) -> list[Row]:
     """Look at the given ports, or at all adapters; `root` has /sys, /dev, /proc and /run."""
-    from tactomo.acquisition.adapters import list_adapters, modem_manager_runs
-
     adapters = list_adapters(root)
     by_path = {adapter.path: adapter for adapter in adapters}
     has_modem_manager = modem_manager_runs(root)
@@ -150,9 +156,6 @@ def lines(rows: Sequence[Row], answers: dict[str, Hello | str]) -> list[str]:
 def _row(
     path: str, adapter: Adapter | None, others: list[Adapter], has_modem_manager: bool, root: Path
 ) -> Row:
-    from tactomo.acquisition.adapters import lasting_name
-    from tactomo.acquisition.open_serial import other_holders
-
     use = lasting_name(adapter, others) if adapter else ""
     remarks = list(_access(path))
     if adapter is not None:
@@ -161,8 +164,6 @@ def _row(
 
 
 def _access(path: str) -> list[str]:
-    from tactomo.acquisition.open_serial import how_to_grant
-
     if not os.path.exists(path) or os.access(path, os.R_OK | os.W_OK):
         return []
     return [f"you may not open it; {how_to_grant(path)}"]
@@ -172,8 +173,6 @@ def _remarks(
     adapter: Adapter, others: list[Adapter], use: str, has_modem_manager: bool
 ) -> list[str]:
     """Return in words what may go wrong with an adapter."""
-    from tactomo.acquisition.adapters import LOW_LATENCY_MS, look_alikes
-
     remarks = []
     twins = look_alikes(adapter, others)
     if twins:

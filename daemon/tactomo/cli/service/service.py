@@ -4,15 +4,25 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
+from tactomo_client.messages import check_sensor_name
 
+from tactomo.acquisition.adapters import list_adapters
 from tactomo.cli.options import examples, typer_app
 from tactomo.cli.output import say
-
-if TYPE_CHECKING:
-    from tactomo.service.installation import Plan
+from tactomo.errors import ServiceError
+from tactomo.service.installation import (
+    PROGRAM,
+    Plan,
+    check_running_systemd,
+    plan_install,
+    plan_uninstall,
+    shipped,
+    this_program,
+    udev_rules,
+)
 
 app = typer_app(
     help="Let systemd run a skin's daemon: at boot, restarted, in a sandbox.",
@@ -58,11 +68,6 @@ def install(
     skins one by one, each with addresses of its own, or write one configuration for all skins
     (deploy/examples/robot.toml).
     """
-    from tactomo_client.messages import check_sensor_name
-
-    from tactomo.acquisition.adapters import list_adapters
-    from tactomo.service.installation import plan_install, udev_rules
-
     check_sensor_name(name, "skin")
     rules, names = udev_rules(name, port, list_adapters())
     for unnamed in set(port).intersection(names):
@@ -88,10 +93,6 @@ def uninstall(
     root: Root = Path("/"),
 ) -> None:
     """Stop the service of a skin, or of all, and remove it. Configuration and recordings stay."""
-    from tactomo_client.messages import check_sensor_name
-
-    from tactomo.service.installation import plan_uninstall
-
     if name is not None:
         check_sensor_name(name, "skin")
     _carry_out(plan_uninstall(name, root.absolute()), dry_run)
@@ -100,16 +101,11 @@ def uninstall(
 @app.command(epilog=examples("tactomo service example > skin.toml"))
 def example() -> None:
     """Print a daemon's configuration with every key and its meaning."""
-    from tactomo.service.installation import shipped
-
     say(shipped("daemon.example.toml"), nl=False)
 
 
 def _program(dry_run: bool) -> str:
     """Return the program that the service is to call; who only looks may do so from anywhere."""
-    from tactomo.errors import ServiceError
-    from tactomo.service.installation import PROGRAM, this_program
-
     try:
         return this_program()
     except ServiceError as error:
@@ -120,9 +116,6 @@ def _program(dry_run: bool) -> str:
 
 
 def _carry_out(plan: Plan, dry_run: bool) -> None:
-    from tactomo.errors import ServiceError
-    from tactomo.service.installation import check_running_systemd
-
     _show(plan, with_text=dry_run)
     if dry_run:
         return

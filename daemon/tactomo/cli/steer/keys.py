@@ -5,15 +5,27 @@ from __future__ import annotations
 import os
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import Annotated, TypeAlias
 
 import typer
+from tactomo_client.keys import read_public
 
 from tactomo.cli.options import KEYS_VARIABLE, examples, typer_app
 from tactomo.cli.output import say
-
-if TYPE_CHECKING:
-    from tactomo.stream.keys import Client
+from tactomo.stream.keys import (
+    Client,
+    clients_folder,
+    default_folder,
+    how_to_allow,
+    list_clients,
+    list_pairs,
+    list_servers,
+    make_pair,
+    public_path,
+    secret_path,
+)
+from tactomo.stream.keys import allow as put_on_list
+from tactomo.stream.keys import revoke as take_off_list
 
 app = typer_app(
     help=(
@@ -58,14 +70,6 @@ def make(
     force: Force = False,
 ) -> None:
     """Make a pair of keys, and print the next steps."""
-    from tactomo.stream.keys import (
-        clients_folder,
-        how_to_allow,
-        make_pair,
-        public_path,
-        secret_path,
-    )
-
     where = (_folder(folder)).absolute()
     make_pair(where, name, is_server=server, force=force)
     secret, public = secret_path(where, name), public_path(where, name)
@@ -108,8 +112,6 @@ def allow(
 
     A running daemon applies the change at once.
     """
-    from tactomo.stream.keys import allow as put_on_list
-
     where = _folder(folder)
     client = put_on_list(where, public, server, may_command=may_command, force=force)
     say(f"{client.name} ({client.public}) {_rights(client)} of {server}, in {where}")
@@ -125,8 +127,6 @@ def revoke(
 
     All other clients of the daemon reconnect by themselves at that moment.
     """
-    from tactomo.stream.keys import revoke as take_off_list
-
     where = _folder(folder)
     take_off_list(where, name, server)
     say(f"{name} is off the list of {server}, in {where}")
@@ -135,10 +135,6 @@ def revoke(
 @app.command("list", epilog=examples("tactomo keys list"))
 def list_(folder: Folder = None) -> None:
     """List the keys made here, and for each server the allowed clients."""
-    from tactomo_client.keys import read_public
-
-    from tactomo.stream.keys import list_clients, list_pairs, list_servers, public_path
-
     where = _folder(folder)
     pairs, servers = list_pairs(where), list_servers(where)
     if not pairs and not servers:
@@ -154,8 +150,6 @@ def list_(folder: Folder = None) -> None:
 
 
 def _folder(given: Path | None) -> Path:
-    from tactomo.stream.keys import default_folder
-
     return given or default_folder()
 
 

@@ -6,18 +6,25 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+import numpy as np
 import typer
+from rich.color import Color
+from rich.console import Group, RenderableType
+from rich.live import Live
+from rich.panel import Panel
+from rich.style import Style
+from rich.table import Table
+from rich.text import Text
+from tactomo_client import Event, Frame, Status, subscribe
+from tactomo_client.appearance import companion_words, force_words, map_pixels, pressure_words
+from tactomo_client.schema import TOUCHES_SEEN
 
 from tactomo.cli import options
+from tactomo.cli.console import Console
 from tactomo.cli.sensors import find_sensor
 from tactomo.plain import plain
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
-    from rich.text import Text
-    from tactomo_client import Event, Frame, Status
 
 REFRESH_HZ = 12.0
 
@@ -42,8 +49,6 @@ def watch(
     In a pipe, the command prints one line per frame instead. Ctrl-C ends the command. If no such
     sensor runs at the start, the exit status is 1.
     """
-    from tactomo.cli.console import Console
-
     found = find_sensor(sensor, address, keys)
     view = View(found.sensor, found.stream, keys)
     console = Console()
@@ -63,8 +68,6 @@ class View:
     """The newest frame, status and event of one sensor."""
 
     def __init__(self, sensor: str, stream: str, keys: Path | None = None) -> None:
-        from tactomo_client import subscribe
-
         self.sensor = sensor
         self.stream = stream
         self.frame: Frame | None = None
@@ -100,8 +103,6 @@ class View:
         return self.frame is not None and self.frame.is_stale and not stands
 
     def _take(self, item: Frame | Status | Event) -> None:
-        from tactomo_client import Frame, Status
-
         if isinstance(item, Frame):
             self.frame = item
         elif isinstance(item, Status):
@@ -111,8 +112,6 @@ class View:
 
 
 def _show_live(view: View, console: Any, end_s: float) -> None:
-    from rich.live import Live
-
     with Live(console=console, screen=True, auto_refresh=False) as live:
         while time.monotonic() < end_s:
             next_s = time.monotonic() + 1.0 / REFRESH_HZ
@@ -135,8 +134,6 @@ def _print_lines(view: View, end_s: float) -> None:
 
 def frame_line(frame: Frame) -> str:
     """Return one frame as a line of text."""
-    from tactomo_client.appearance import force_words, pressure_words
-
     pressed = "; ".join(
         f"#{c.id} ({c.x_mm:+.1f}, {c.y_mm:+.1f}) mm {pressure_words(c)}{force_words(c, ', ')}"
         for c in frame.contacts
@@ -147,17 +144,10 @@ def frame_line(frame: Frame) -> str:
 
 
 def _without_contacts(frame: Frame) -> str:
-    from tactomo_client.schema import TOUCHES_SEEN
-
     return "nothing pressed" if frame.flags <= TOUCHES_SEEN else "not known"
 
 
 def _screen(view: View, columns: int, rows: int) -> RenderableType:
-    from rich.console import Group
-    from rich.panel import Panel
-    from rich.table import Table
-    from rich.text import Text
-
     frame = view.frame
     if frame is None:
         return Panel(_state_line(view), title=Text(f"tactomo watch {view.sensor}"))
@@ -175,8 +165,6 @@ def _screen(view: View, columns: int, rows: int) -> RenderableType:
 
 
 def _state_line(view: View) -> Text:
-    from rich.text import Text
-
     if view.status is None or view.is_gone:
         return Text(
             f"no daemon answers at {view.stream} for a sensor {view.sensor!r}: is it running?",
@@ -199,12 +187,6 @@ def map_text(frame: Frame, description: Mapping[str, Any], columns: int) -> Text
     Each character is two nodes, one above the other. Colour is pressure, or the relative change
     where the sensor has no pressure calibration; pressed outlines without a value are blue-grey.
     """
-    import numpy as np
-    from rich.color import Color
-    from rich.style import Style
-    from rich.text import Text
-    from tactomo_client.appearance import map_pixels
-
     pixels = map_pixels(frame, description)
     if pixels is None:
         return Text("no image: " + ", ".join(sorted(frame.flags)))
@@ -222,10 +204,6 @@ def map_text(frame: Frame, description: Mapping[str, Any], columns: int) -> Text
 
 
 def _contact_table(frame: Frame, is_stale: bool) -> RenderableType:
-    from rich.table import Table
-    from rich.text import Text
-    from tactomo_client.appearance import force_words, pressure_words
-
     if not frame.contacts:
         return Text("not known" if is_stale else _without_contacts(frame), "dim")
     table = Table(box=None, pad_edge=False)
@@ -238,10 +216,6 @@ def _contact_table(frame: Frame, is_stale: bool) -> RenderableType:
 
 
 def _health(view: View, frame: Frame) -> RenderableType:
-    from rich.table import Table
-    from rich.text import Text
-    from tactomo_client.appearance import companion_words
-
     status = view.status
     latency = status and status.latency_ms
     companions = status.companions if status else {}
