@@ -29,6 +29,10 @@ from tactomo_client import ClientError, ControlError, Event, Frame, Keys, KeysEr
 from tactomo_client.appearance import companion_words
 
 IMAGES = ("map", "pressure_kpa", "structure")
+FRAME_FIELDS = (
+    *("session", "sequence", "scan_counter", "tier", "tier_reason", "misfit", "confidence"),
+    *("x_mm", "y_mm"),
+)
 
 
 def frame_message(frame: Frame) -> bytes:
@@ -37,17 +41,9 @@ def frame_message(frame: Frame) -> bytes:
     header = {
         "sent_ms": sent_ms(),
         "age_ms": frame.age_s * 1e3,
-        "session": frame.session,
-        "sequence": frame.sequence,
-        "scan_counter": frame.scan_counter,
-        "tier": frame.tier,
-        "tier_reason": frame.tier_reason,
+        **{name: getattr(frame, name) for name in FRAME_FIELDS},
         "flags": sorted(frame.flags),
-        "misfit": frame.misfit,
-        "confidence": frame.confidence,
         "contacts": [dataclasses.asdict(contact) for contact in frame.contacts],
-        "x_mm": frame.x_mm,
-        "y_mm": frame.y_mm,
         "images": [{"name": name, "shape": image.shape} for name, image in images.items()],
     }
     text = json_text(header).encode()

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from tactomo_models import ModelError, Reference
@@ -43,13 +43,6 @@ slowly, a few of their periods."""
 Volts = FloatArray
 
 
-class _Taken(NamedTuple):
-    """A reference that was taken, while it is found out what it tells."""
-
-    scans: _Scans
-    tare: Future[Tare]
-
-
 @dataclass(eq=False)
 class Taring:
     """Takes references for one sensor. For use by the pipeline thread.
@@ -74,7 +67,8 @@ class Taring:
         self.has_reference = False  # then a tare that is refused is not begun again
         self._tare: _Scans | None = None
         self._deadline_s = 0.0
-        self._taken: _Taken | None = None  # the next tare waits for it, whoever asks meanwhile
+        # while it is found out what they tell: the next tare waits for it, whoever asks meanwhile
+        self._taken: _Scans | None = None
         self._finder = ThreadPoolExecutor(1, "sheets")  # the thread starts with the first tare
 
     @property
@@ -97,7 +91,7 @@ class Taring:
         """Put in force what is ready; give up a tare on command for which nothing comes."""
         if (taken := self._taken) is not None:
             self._put_off()
-            if not self._waits and not taken.tare.done():
+            if not self._waits and not taken.told.done():
                 return
             self._finish(taken)
         if (tare := self._tare) and tare.answers and time.monotonic() > self._deadline_s:
@@ -143,13 +137,14 @@ class Taring:
         except ModelError as error:
             self._refuse(tare, _refusal_of(error))
             return
-        self._taken = _Taken(tare, self._finder.submit(self._take, reference))
+        tare.told = self._finder.submit(self._take, reference)
+        self._taken = tare
         self.check()
 
-    def _finish(self, taken: _Taken) -> None:
-        tare, contacts = taken.scans, taken.scans.contacts
+    def _finish(self, tare: _Scans) -> None:
+        contacts = tare.contacts
         try:
-            known = taken.tare.result()
+            known = tare.told.result()
             is_new = self._put_in_force(known, bool(tare.answers), contacts)
         except ModelError as error:
             self._refuse(tare, _refusal_of(error))
@@ -189,6 +184,7 @@ class _Scans:
     def __init__(self, scans: int) -> None:
         self.answers: list[Future[Mapping[str, Any]]] = []
         self.contacts = 0  # how many were shown meanwhile, at most
+        self.told: Future[Tare]  # what their reference tells, once there are enough
         self._wanted = scans
         self._volts: dict[Channel, list[Volts]] = {}
         self._readings: dict[str, list[float]] = {}  # of companions

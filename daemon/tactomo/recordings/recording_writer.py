@@ -326,7 +326,7 @@ class ActiveRecording:
         self._begin_s = time.monotonic()
         self._lock = threading.Lock()
         self._entries: list[Entry] = []  # this and the next three under the lock
-        self._queued_bytes = 0
+        self.queued_bytes = 0  # what waits for the disk
         self._has_ended = False
         self._is_told = False
         self._synced_s = self._begin_s
@@ -338,22 +338,17 @@ class ActiveRecording:
         """How long ago the first of it was written, or the file begun."""
         return time.monotonic() - self._begin_s
 
-    @property
-    def queued_bytes(self) -> int:
-        """What waits for the disk."""
-        return self._queued_bytes
-
     def add(self, *entries: Entry) -> bool:
         """Add entries in order, all or none; never waits. False: it takes no more."""
         size = sum(len(entry.data) + ENTRY_BYTES for entry in entries)
         with self._lock:
             if self._has_ended or self.is_overflowed:
                 return False
-            if self._queued_bytes + size > MAX_QUEUED_BYTES:
+            if self.queued_bytes + size > MAX_QUEUED_BYTES:
                 self.is_overflowed = True
                 return False
             self._entries += entries
-            self._queued_bytes += size
+            self.queued_bytes += size
         return True
 
     def tell_once(self) -> bool:
@@ -372,7 +367,7 @@ class ActiveRecording:
             self._writer.add(entry)
         self.bytes_written = self._writer.flush()
         with self._lock:
-            self._queued_bytes -= sum(len(entry.data) + ENTRY_BYTES for entry in entries)
+            self.queued_bytes -= sum(len(entry.data) + ENTRY_BYTES for entry in entries)
 
     def sync(self, period_s: float) -> None:
         """Have what was written outlive a loss of power, once a period; 0 leaves that to chance.
@@ -409,7 +404,7 @@ class ActiveRecording:
         """Close the file as it is, and forget what was not written."""
         with self._lock:
             self._has_ended = True
-            self._entries, self._queued_bytes = [], 0
+            self._entries, self.queued_bytes = [], 0
         self._writer.abandon()
 
     @property

@@ -259,7 +259,6 @@ _COUNTED: Final = frozenset(
     }
 )
 """Fields of a status that differ from second to second; some of them say something beside that."""
-_HEARTBEATS_S: Final[Mapping[str, float]] = {STATUS: STATUS_HEARTBEAT_S}
 _HELD: Final = (MAP, CONTACTS, STATUS)
 _ANSWERED: Final = (STATUS, CONTACTS)
 _PRIORITIES: Final[Mapping[str, zenoh.Priority]] = {
@@ -359,7 +358,8 @@ class _Skin:
             if isinstance(recording := fields.get("recording"), dict):
                 content["recording"] = recording.get("path")
         sent_s, last = self._sent.get(kind, (0.0, {}))
-        if content == last and now_s - sent_s < _HEARTBEATS_S.get(kind, HEARTBEAT_S):
+        heartbeat_s = STATUS_HEARTBEAT_S if kind == STATUS else HEARTBEAT_S
+        if content == last and now_s - sent_s < heartbeat_s:
             return False
         self._sent[kind] = now_s, content
         return True

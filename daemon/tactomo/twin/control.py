@@ -93,26 +93,22 @@ class ControlSocket:
 
     def __init__(self, address: str, handlers: Mapping[str, Handler]) -> None:
         self._handlers = handlers
-        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REP)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
-        self.address = bind(self._socket, address, "control", option="--twin-control")
-
-    @property
-    def socket(self) -> zmq.Socket[bytes]:
-        """What to poll for requests."""
-        return self._socket
+        # what to poll for requests
+        self.socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REP)
+        self.socket.setsockopt(zmq.LINGER, 0)
+        self.socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
+        self.address = bind(self.socket, address, "control", option="--twin-control")
 
     def answer(self) -> None:
         """Answer every request that waits; returns at once when there is none."""
-        while self._socket.poll(0):
-            request = self._socket.recv_multipart()
-            self._socket.send(self._reply(request[0] if len(request) == 1 else b""))
+        while self.socket.poll(0):
+            request = self.socket.recv_multipart()
+            self.socket.send(self._reply(request[0] if len(request) == 1 else b""))
 
     def close(self) -> None:
         """Unbind."""
         remove_file(self.address)
-        self._socket.close()
+        self.socket.close()
 
     def _reply(self, data: bytes) -> bytes:
         try:

@@ -32,7 +32,7 @@ from tactomo.config import Endpoint
 from tactomo.endpoint import is_local
 from tactomo.errors import CommandError, ConfigError
 from tactomo.plain import counted
-from tactomo.protocols import NATIVE, check_scan_fits, emulator_of, find_protocol
+from tactomo.protocols import NATIVE, emulator_of, find_protocol, protocol_named
 from tactomo.protocols.interface import TWIN_ID, hello_of
 from tactomo.stream.commands import Nothing, explained
 from tactomo.twin.control import (
@@ -113,7 +113,8 @@ class TwinConfig:
                 "there could press the twin",
                 "use tcp://127.0.0.1:PORT or ipc://PATH",
             )
-        check_scan_fits(self.description)
+        protocol = find_protocol(self.protocol).name
+        protocol_named(protocol, self.description)  # or says why it cannot carry the sensor
         channels = len(self.description.channels)
         if self.ports not in (1, 2) or self.ports > channels:
             raise ConfigError(
@@ -121,14 +122,8 @@ class TwinConfig:
                 f"so not {self.ports} ports",
                 "give 1 port, or 2 for a sensor of two channels",
             )
-        if self.protocol != NATIVE:
-            emulator_of(find_protocol(self.protocol).name)
-        if self.protocol != NATIVE and channels > 1:
-            raise ConfigError(
-                f"{self.description.name} has two channels, and a device of protocol "
-                f"{self.protocol} carries one",
-                "give the description of a sensor with one channel, such as tank_disc",
-            )
+        if protocol != NATIVE:
+            emulator_of(protocol)
         companion = next(iter(self.description.companion), None)
         if self.protocol != NATIVE and companion is not None:
             raise ConfigError(

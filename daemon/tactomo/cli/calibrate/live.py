@@ -55,10 +55,6 @@ STILL_SHARE: Final = 0.03
 """Of the magnitude, by which it may change from the first half to the second."""
 SHARES: Final = (-0.3, -0.05, 0.1, 0.25, 0.4, 0.6, 0.8, 1.0)
 """Of the way from the onset to the top, that are suggested going up; and down again."""
-COLUMNS: Final = (
-    *("realtime_s", "pressure_kpa", "force_n", "area_mm2", "magnitude", "magnitude_sigma"),
-    *("direction", "x_mm", "y_mm", "contact_mm2"),
-)
 
 
 class Held(NamedTuple):
@@ -142,7 +138,8 @@ class _Session:
         log: Path,
     ) -> None:
         self._view, self._console, self._log = view, console, log
-        self._area_mm2 = area_mm2
+        self._given_mm2 = area_mm2
+        self._area_mm2 = math.nan  # of the indenter: what was given, or is asked for first
         self._suggested = suggestions_kpa(status)
         self.readings: list[Reading] = _read_log(log)
 
@@ -165,9 +162,10 @@ class _Session:
             "newtons. undo drops\nthe last reading, done or Ctrl-C ends. Each "
             "reading is kept at once."
         )
-        if self._area_mm2 is None:
+        if self._given_mm2 is None:
             diameter_mm = self._asked("Diameter of the indenter in mm: ", least=1.0, most=1e3)
-            self._area_mm2 = math.pi / 4 * diameter_mm**2
+            self._given_mm2 = math.pi / 4 * diameter_mm**2
+        self._area_mm2 = self._given_mm2
         if self.readings:
             kept = f"{len(self.readings)} readings in {self._log}"
             say(f"Going on with {kept}; delete the file to begin anew.")
@@ -175,7 +173,6 @@ class _Session:
 
     def _take_one(self) -> bool:
         """Take one reading, or undo one; returns whether to go on."""
-        assert self._area_mm2 is not None
         word = self._console.input(f"\n{self._what_to_press()}\nEnter when it is held: ").strip()
         if word in ("done", "q", "quit"):
             return False
@@ -187,17 +184,13 @@ class _Session:
             f"still: |Δσ|/σ₀ {held.magnitude:.4f} ± {held.magnitude_sigma:.4f} at "
             f"({held.x_mm:.1f}, {held.y_mm:.1f}) mm, {held.frames} frames"
         )
-        force_n = self._asked("Load cell in N: ", least=0.0, most=self._largest_n())
+        # What no skin bears: a slip beyond that would spoil the fit of all others.
+        largest_n = MAX_KPA * 1e-3 * self._area_mm2
+        force_n = self._asked("Load cell in N: ", least=0.0, most=largest_n)
         self._keep(held, force_n)
         return True
 
-    def _largest_n(self) -> float:
-        """By what no skin bears: a slip beyond that would spoil the fit of all others."""
-        assert self._area_mm2 is not None
-        return MAX_KPA * 1e-3 * self._area_mm2
-
     def _what_to_press(self) -> str:
-        assert self._area_mm2 is not None
         number = len(self.readings)
         kpa = self._suggested[number % len(self._suggested)]
         force_n = kpa * 1e-3 * self._area_mm2
@@ -249,8 +242,6 @@ class _Session:
         return "" if _are_still(frames) else "moving: hold it still"
 
     def _keep(self, held: Held, force_n: float) -> None:
-
-        assert self._area_mm2 is not None
         kpa = 1e3 * force_n / self._area_mm2
         before = [reading.pressure_kpa for reading in self.readings]
         row = {
@@ -356,7 +347,7 @@ def _append(log: Path, row: dict[str, str]) -> None:
         log.parent.mkdir(parents=True, exist_ok=True)
         is_new = not log.exists()
         with log.open("a", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS)
+            writer = csv.DictWriter(file, list(row))
             if is_new:
                 writer.writeheader()
             writer.writerow(row)
