@@ -24,16 +24,6 @@ LOG_PERIOD_S: Final = 300.0
 TROUBLES_KEPT: Final = 8
 RECORDED: Final = "so it was recorded"
 """The next step in a replay of what was the recorded skin's, where nothing is to be mended."""
-OF_THE_SKIN: Final = frozenset(
-    (
-        *("baseline_refused", "channel_back", "channel_lost", "channels_skewed", "companion_lost"),
-        *("companion_unknown", "converter_frozen", "corrupt_packets", "device_changed"),
-        *("device_clock_jumped", "device_clock_unusable", "device_garbled", "device_idle"),
-        *("device_restarted", "device_silent", "firmware_fault", "reference_disputed"),
-        *("scans_disordered", "skin_changed"),
-    )
-)
-"""Events whose next step is at the skin, its boards and its cables."""
 ENDS: Final = frozenset(kind.end for kind in EVENTS.values())
 
 

@@ -170,7 +170,8 @@ class Recording:
 
 def _files_in(folder: Path, sensor: str | None) -> tuple[Path, ...]:
     """Return the files of a folder's one sensor, in the order in which they were made."""
-    named = [(match, path) for path in folder.iterdir() if (match := _name(path))]
+    found = [(re.fullmatch(ROTATED_NAME, path.name, re.ASCII), path) for path in folder.iterdir()]
+    named = [(match, path) for match, path in found if match]
     sensors = sorted({match["sensor"] for match, _ in named})
     if sensor is None and len(sensors) > 1:
         raise RecordingError(
@@ -185,10 +186,6 @@ def _files_in(folder: Path, sensor: str | None) -> tuple[Path, ...]:
             "give the daemon's folder of recordings, or the path of a .mcap file",
         )
     return tuple(files[number] for number in sorted(files))
-
-
-def _name(path: Path) -> re.Match[str] | None:
-    return re.fullmatch(ROTATED_NAME, path.name, re.ASCII)
 
 
 def _has_frames(path: Path) -> bool:

@@ -315,12 +315,15 @@ class EventKind:
     # goes on. 0: each
     period_s: float = 0.0
     end: str = ""  # the event that says that it is over: until then it is told once
+    at_skin: bool = False  # whether its next step is at the skin, its boards and its cables
 
 
 INFO: Final = EventKind("info")
 WARNING: Final = EventKind("warning")
 ERROR: Final = EventKind("error")
 FREQUENT: Final = EventKind("warning", period_s=1.0)
+SKIN: Final = EventKind("warning", at_skin=True)
+SKIN_FREQUENT: Final = EventKind("warning", period_s=1.0, at_skin=True)
 
 
 class Events:
@@ -332,38 +335,39 @@ class Events:
     #: By the reference kept from before, something seems to lie on the skin: the kept reference
     #: stays in use. Or a tare was taken while contacts were shown, or right after such a tare and
     #: under the same load. See the flag of this name
-    reference_disputed = WARNING
+    reference_disputed = SKIN
     #: At the start, neither drift nor contacts explain the difference from the kept reference: the
     #: skin seems to be another one. The new reference is used
-    skin_changed = WARNING
+    skin_changed = SKIN
     #: The skin is at rest by the kept reference, or by the reference before a disputed tare
     reference_confirmed = INFO
     #: The reference cannot be written for the next start, or the kept reference cannot be read
     reference_not_kept = EventKind("warning", period_s=600.0)
     #: A change is neither clearly a contact nor clearly drift: the reference does not follow the
     #: change. ``baseline`` in the status shows this while it lasts
-    baseline_refused = EventKind("warning", period_s=600.0)
+    baseline_refused = EventKind("warning", period_s=600.0, at_skin=True)
     #: Scans of one channel are missing; maps continue from the other channel
-    channel_lost = EventKind("warning", end="channel_back")
-    channel_back = INFO  #: The missing channel sends scans again
+    channel_lost = EventKind("warning", end="channel_back", at_skin=True)
+    channel_back = EventKind("info", at_skin=True)  #: The missing channel sends scans again
     #: A companion of the sensor description has had no reading within its limits for 1 s: see the
     #: flag ``companion_missing``
-    companion_lost = EventKind("warning", end="companion_back")
+    companion_lost = EventKind("warning", end="companion_back", at_skin=True)
     companion_back = INFO  #: The companion reads again within its limits
     #: A device sends readings of a companion whose index the sensor description does not have
-    companion_unknown = EventKind("warning", period_s=600.0)
+    companion_unknown = EventKind("warning", period_s=600.0, at_skin=True)
     #: Scans of one channel repeat one of their last 16, but for less than a tenth of the tare's
     #: noise, while their counter rises: the daemon treats them as missing. Of drives or measuring
     #: pairs that repeat bit for bit, the daemon leaves out those alone (``invalid_voltage``). A
     #: converter that is frozen during the first tare cannot be told from a source without noise;
     #: `tactomo doctor` then reports "no noise at all". Where the noise really fell so far, tare
-    converter_frozen = EventKind("warning", end="converter_back")
+    converter_frozen = EventKind("warning", end="converter_back", at_skin=True)
     converter_back = INFO  #: The channel's scans change again
     #: A port was closed, unplugged, or cannot be opened. The daemon keeps trying
     port_lost = EventKind("error", end="port_back")
     port_back = INFO  #: The port is open again
-    corrupt_packets = FREQUENT  #: Packets on a port were damaged in transit
-    scans_disordered = FREQUENT  #: Scans of a channel arrived after later scans and are left out
+    corrupt_packets = SKIN_FREQUENT  #: Packets on a port were damaged in transit
+    #: Scans of a channel arrived after later scans and are left out
+    scans_disordered = SKIN_FREQUENT
     scans_dropped = FREQUENT  #: Reconstruction lagged: dual scans were left out
     #: Reconstruction lagged because other programs use the processor: each frame gets half as much
     #: time as before
@@ -372,17 +376,18 @@ class Events:
     method_failed = FREQUENT  #: A method of your own failed: the frame was made by ``tikhonov``
     #: A defect in tactomo: a dual scan gave no frame
     reconstruction_failed = EventKind("error", period_s=1.0)
-    device_restarted = FREQUENT  #: A device was reset: its scan counter and its clock went back
+    #: A device was reset: its scan counter and its clock went back
+    device_restarted = SKIN_FREQUENT
     #: The scan counter went back, the clock did not: somebody zeroed the counter
     counters_zeroed = EventKind("info", period_s=1.0)
     #: A device's clock jumped or went back. Scans are dated by arrival until the clock is known
     #: again
-    device_clock_jumped = FREQUENT
+    device_clock_jumped = SKIN_FREQUENT
     #: A device's clock stands still or runs at an impossible rate. Scans are dated by arrival
-    device_clock_unusable = WARNING
+    device_clock_unusable = SKIN
     #: The two channels' counters are out of step: see the flag. The daemon asks two boards to zero
     #: their counters
-    channels_skewed = EventKind("warning", end="channels_in_step")
+    channels_skewed = EventKind("warning", end="channels_in_step", at_skin=True)
     channels_in_step = INFO  #: The two channels' counters are in step again
     #: The computer's clock was set, or the computer slept. Only ``acquired_realtime_ns`` follows it
     wall_clock_jumped = WARNING
@@ -395,22 +400,22 @@ class Events:
     calibration_reloaded = INFO
     #: A port, or the sensor at a start, has another device than before, and the new device is used.
     #: Exchange the cables back, or tare if the skin is another one
-    device_changed = FREQUENT
+    device_changed = SKIN_FREQUENT
     #: Nothing came over an open port for 3 s (or three periods of a slower device, or as long as
     #: its protocol allows). The daemon asks the device again; later the daemon reopens the port,
     #: ever more rarely
-    device_silent = EventKind("warning", period_s=30.0, end="device_speaks")
+    device_silent = EventKind("warning", period_s=30.0, end="device_speaks", at_skin=True)
     #: Bytes came but no packet, for as long: a wrong baud rate, or no skin
-    device_garbled = EventKind("warning", period_s=30.0, end="device_speaks")
+    device_garbled = EventKind("warning", period_s=30.0, end="device_speaks", at_skin=True)
     #: A device sends packets but no scans, for as long, although the daemon asked it to start
-    device_idle = EventKind("warning", period_s=30.0, end="device_speaks")
+    device_idle = EventKind("warning", period_s=30.0, end="device_speaks", at_skin=True)
     device_speaks = INFO  #: The device is no longer silent, garbled, idle or refused
     #: An FTDI adapter holds bytes back for long, and the daemon may not change that
     latency_timer = WARNING
     #: A device's packets are intact but break [the protocol](../firmware_protocol/PROTOCOL.md):
     #: another version, a field out of range, or scans unlike the *hello*. These packets are not
     #: used
-    firmware_fault = EventKind("warning", period_s=30.0)
+    firmware_fault = EventKind("warning", period_s=30.0, at_skin=True)
     #: A device sends packets but has acknowledged no command for 3 s
     command_unanswered = EventKind("warning", period_s=600.0)
     command_refused = WARNING  #: A device did not carry out a command of the daemon

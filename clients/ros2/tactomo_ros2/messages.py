@@ -237,24 +237,21 @@ def _pose(contact: Contact, header: Any) -> Any:
 
 
 def _transforms(frame: Frame, header: Any) -> list[Any]:
-    def transform(parent: str, child: str, position: Vector, turned: Quaternion) -> Any:
-        x, y, z, w = turned
+    hung = []
+    for contact in frame.contacts:
+        parent, position, (x, y, z, w) = _whereabouts(contact, frame.sensor)
         pose = _new(
             "geometry_msgs/msg/Transform",
             translation=_vector(*position),
             rotation=_new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
         )
-        return _new(
+        transform = _new(
             "geometry_msgs/msg/TransformStamped",
             header=_in(header, parent),
-            child_frame_id=child,
+            child_frame_id=_contact_frame(frame, contact),
             transform=pose,
         )
-
-    hung = []
-    for contact in frame.contacts:
-        parent, position, turned = _whereabouts(contact, frame.sensor)
-        hung.append(transform(parent, _contact_frame(frame, contact), position, turned))
+        hung.append(transform)
     return hung
 
 

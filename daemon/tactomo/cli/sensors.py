@@ -7,12 +7,16 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
 from tactomo.cli.options import DEFAULT_NAME
 from tactomo.errors import TactomoError
 from tactomo.running import Running, running
+
+if TYPE_CHECKING:
+    from tactomo_client import Keys
+    from tactomo_client.connection import Connection
 
 ALL_S: Final = 1.2  # so long, and every sensor of a stream has been heard
 
@@ -168,25 +172,33 @@ def _from_here(control: str, stream: str) -> str:
 
 def _statuses(name: str | None, address: str, keys: Path | None) -> Mapping[str, Mapping[str, Any]]:
     """Return the newest status of each sensor that a stream carries, or of the named one."""
-    import zmq
-    from tactomo_client.connection import connect_subscriber
-    from tactomo_client.keys import as_keys
     from tactomo_client.messages import STATUS, topic
     from tactomo_client.schema import STALE_AFTER_S
 
     heard: dict[str, Mapping[str, Any]] = {}
-    topics = [b"" if name is None else topic(name, STATUS)]
-    known = as_keys(keys)  # or raises, before there is a socket
-    socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
-    connection = connect_subscriber(socket, address, topics, keys=known)
-    end_s = time.monotonic() + STALE_AFTER_S
-    try:
+    with listening(address, [b"" if name is None else topic(name, STATUS)], keys) as connection:
+        end_s = time.monotonic() + STALE_AFTER_S
         while (left_s := end_s - time.monotonic()) > 0 and not (name and heard):
             for message in connection.heard(min(left_s, 0.1)):
                 if not heard:
                     end_s = min(end_s, time.monotonic() + ALL_S)
                 if message.kind == STATUS:
                     heard[message.sensor] = message.fields
+    return heard
+
+
+@contextmanager
+def listening(address: str, topics: list[bytes], keys: Keys | Path | None) -> Iterator[Connection]:
+    """Subscribe to these topics of a stream while a block lasts."""
+    import zmq
+    from tactomo_client.connection import connect_subscriber
+    from tactomo_client.keys import as_keys
+
+    known = as_keys(keys)  # or raises, before there is a socket
+    connection = connect_subscriber(
+        zmq.Context.instance().socket(zmq.SUB), address, topics, keys=known
+    )
+    try:
+        yield connection
     finally:
         connection.close()
-    return heard

@@ -67,7 +67,7 @@ from tactomo.config import DaemonConfig
 from tactomo.ending import at_end
 from tactomo.endpoint import allow_connections
 from tactomo.errors import CommandError, ConfigError
-from tactomo.events import OF_THE_SKIN, RECORDED, EventBook
+from tactomo.events import RECORDED, EventBook
 from tactomo.imaging.imaging import Imaging
 from tactomo.imaging.kept_reference import KeptReference, reference_path
 from tactomo.imaging.pipeline import Pipeline
@@ -482,9 +482,10 @@ class Daemon:
     ) -> bool:
         if not self._events.is_due(name, about, reason):
             return False
-        if self._replay is not None and next_step and name in OF_THE_SKIN:
+        kind = EVENTS[name]
+        if self._replay is not None and next_step and kind.at_skin:
             next_step = RECORDED
-        severity, spared = EVENTS[name].severity, self._events.note(name, detail, next_step)
+        severity, spared = kind.severity, self._events.note(name, detail, next_step)
         if spared is not None:
             extra: dict[str, Any] = {"next_step": next_step} if next_step else {}
             if spared:

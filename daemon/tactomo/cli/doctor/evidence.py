@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import zmq
 from numpy.typing import NDArray
 from tactomo_client import Keys
-from tactomo_client.connection import Connection, connect_subscriber
+from tactomo_client.connection import Connection
 from tactomo_client.messages import MAP, SCAN, STATUS, array_from_wire, topic
 from tactomo_client.schema import STALE_AFTER_S
 from tactomo_models import DescriptionError, load_description
@@ -29,7 +28,7 @@ from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
 from tactomo_models.sensor.pattern import PatternLayout, scan_pairs
 from tactomo_protocol import SCAN_COUNTERS, Channel, Hello, Scan, ScanFlag
 
-from tactomo.cli.sensors import of_this_version
+from tactomo.cli.sensors import listening, of_this_version
 from tactomo.errors import TactomoError
 from tactomo.recordings.imported_scans import AT_REST, is_single_ended, load_arrays, read_scans
 from tactomo.recordings.recording import Recording
@@ -92,17 +91,13 @@ def of_daemon(
 ) -> Evidence:
     """Listen to a daemon; raise TactomoError where none answers, or it has no scans."""
     said: dict[str, list[dict[str, Any]]] = {MAP: [], SCAN: [], STATUS: []}
-    socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
-    connection = connect_subscriber(socket, stream, [topic(sensor, k) for k in said], keys=keys)
-    try:
+    with listening(stream, [topic(sensor, kind) for kind in said], keys) as connection:
         before = _first_status(connection, f"{stream} for a sensor {sensor!r}")
         begin_s = time.monotonic()
         while (passed_s := time.monotonic() - begin_s) < seconds:
             progress(passed_s)
             for message in connection.heard(min(0.2, seconds - passed_s)):
                 said[message.kind].append(message.fields)
-    finally:
-        connection.close()
     is_ours = any(each.stream == stream for each in running("daemon"))
     with of_this_version():
         evidence = evidence_of_messages(said, [before, *said[STATUS]], description, is_ours)
