@@ -79,48 +79,98 @@ def check_closed(clients: Path) -> None:
             )
 
 
-class AllowList:
-    """The public keys in a folder, by what their holders may do. For any thread."""
+class AccessControl:
+    """Answers ZeroMQ's question (ZAP) whether a client may come in, in a thread of its own.
 
-    def __init__(self, folder: Path, on_event: OnEvent) -> None:
-        self.revocations = 0  # how often a key was taken away from either socket
-        self._folder = folder
+    `start` it before the sockets of its context are bound, and `stop` it after they are closed.
+    A socket's purpose in `tactomo.endpoint.bind` is its domain here.
+    """
+
+    def __init__(
+        self,
+        context: Context,  # the sockets' context; there is one access control in it
+        keys: ServerKeys,  # who may come in
+        on_event: OnEvent,  # told of those who were refused
+        # called by whoever calls `check` when somebody was taken off the list
+        on_revoked: Callable[[], None],
+    ) -> None:
+        self._clients = keys.clients
         self._on_event = on_event
-        self._lock = threading.Lock()  # held for the reading of some small files
+        self._on_revoked = on_revoked
+        self._checked_s = 0.0  # of the one thread that calls `check`
+        self._refused = 0  # the thread's own
+        self._lock = threading.Lock()  # held for the reading of some small files; of what follows
         self._signature: Signature | None = None
         self._allowed: dict[str, frozenset[bytes]] = {STREAM: frozenset(), CONTROL: frozenset()}
+        self._is_revoked = False  # whether a key was taken away from either socket, and not told
+        self._authenticator = _Authenticator(context)
+        for domain in (STREAM, CONTROL):
+            self._authenticator.configure_curve_callback(domain, self)
 
-    def permits(self, domain: str, key: bytes) -> bool:
-        """Whether the holder of this public key (Z85) may use the socket of this name."""
-        self.reload()
-        return key in self._allowed.get(domain, ())
+    def start(self) -> None:
+        """Start the thread."""
+        self._authenticator.start()
 
-    def reload(self) -> None:
+    def stop(self) -> None:
+        """End the thread."""
+        if not self.is_alive:  # it would be waited for
+            self._authenticator.forget_thread()
+        self._authenticator.stop()
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the thread runs."""
+        return self._authenticator.is_alive()
+
+    def check(self) -> None:
+        """Look for changes of the list, at most once a second; to be called by one thread."""
+        if time.monotonic() - self._checked_s < CHECK_S:
+            return
+        self._checked_s = time.monotonic()
+        self._reload()
+        if self._is_revoked:
+            self._is_revoked = False
+            self._on_revoked()
+
+    def callback(self, domain: str, key: bytes) -> bool:
+        """Return whether a client may come in; called by the thread, with the key in Z85."""
+        self._reload()
+        permitted = key in self._allowed.get(domain, ())
+        if not permitted:
+            self._tell_refused(domain, key.decode("ascii"))
+        return permitted
+
+    def _tell_refused(self, domain: str, key: str) -> None:
+        self._refused += 1
+        self._on_event(
+            "client_refused",
+            f"{self._authenticator.address} may not use the {domain}: its public key {key} is "
+            f"not allowed ({self._refused} refused so far)",
+            "if it is yours, copy its public key (CLIENT.key) to this computer, and "
+            + how_to_allow(self._clients, may_command=domain == CONTROL),
+        )
+
+    def _reload(self) -> None:
         """Read the folder again if it has changed; one that cannot be looked at stays as it was."""
         with self._lock, contextlib.suppress(OSError):  # such as too many open files
-            files = _files(self._folder)
+            files = _files(self._clients)
             signature = _signature([*files[STREAM], *files[CONTROL]])
             if signature != self._signature:
                 self._signature = signature
+                before = self._allowed
                 keys = {domain: self._keys(paths) for domain, paths in files.items()}
-                self._take(keys if self._is_closed() else self._known(keys))
+                if not self._is_closed():  # nobody new comes in
+                    keys = {domain: found & before[domain] for domain, found in keys.items()}
+                self._allowed = {STREAM: keys[STREAM] | keys[CONTROL], CONTROL: keys[CONTROL]}
+                self._is_revoked |= any(before[domain] - self._allowed[domain] for domain in before)
 
     def _is_closed(self) -> bool:
         try:
-            check_closed(self._folder)
+            check_closed(self._clients)
         except KeysError as error:
             self._on_event("client_key_unusable", error.cause, error.next_step)
             return False
         return True
-
-    def _known(self, keys: dict[str, frozenset[bytes]]) -> dict[str, frozenset[bytes]]:
-        """Return those that are allowed already: of an open list, nobody new comes in."""
-        return {domain: found & self._allowed[domain] for domain, found in keys.items()}
-
-    def _take(self, keys: dict[str, frozenset[bytes]]) -> None:
-        before = self._allowed
-        self._allowed = {STREAM: keys[STREAM] | keys[CONTROL], CONTROL: keys[CONTROL]}
-        self.revocations += any(before[domain] - self._allowed[domain] for domain in before)
 
     def _keys(self, paths: list[Path]) -> frozenset[bytes]:
         keys = set()
@@ -147,75 +197,6 @@ def _signature(paths: list[Path]) -> Signature:
             continue
         found.append((str(path), info.st_mtime_ns, info.st_size))
     return tuple(found)
-
-
-class AccessControl:
-    """Answers ZeroMQ's question (ZAP) whether a client may come in, in a thread of its own.
-
-    `start` it before the sockets of its context are bound, and `stop` it after they are closed.
-    A socket's purpose in `tactomo.endpoint.bind` is its domain here.
-    """
-
-    def __init__(
-        self,
-        context: Context,  # the sockets' context; there is one access control in it
-        keys: ServerKeys,  # who may come in
-        on_event: OnEvent,  # told of those who were refused
-        # called by whoever calls `check` when somebody was taken off the list
-        on_revoked: Callable[[], None],
-    ) -> None:
-        self._allowed = AllowList(keys.clients, on_event)
-        self._clients = keys.clients
-        self._on_event = on_event
-        self._on_revoked = on_revoked
-        self._checked_s = 0.0  # of the one thread that calls `check`, as is _revocations
-        self._revocations = 0
-        self._refused = 0  # the thread's own
-        self._authenticator = _Authenticator(context)
-        for domain in (STREAM, CONTROL):
-            self._authenticator.configure_curve_callback(domain, self)
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._authenticator.start()
-
-    def stop(self) -> None:
-        """End the thread."""
-        if not self.is_alive:  # it would be waited for
-            self._authenticator.forget_thread()
-        self._authenticator.stop()
-
-    @property
-    def is_alive(self) -> bool:
-        """Whether the thread runs."""
-        return self._authenticator.is_alive()
-
-    def check(self) -> None:
-        """Look for changes of the list, at most once a second; to be called by one thread."""
-        if time.monotonic() - self._checked_s < CHECK_S:
-            return
-        self._checked_s = time.monotonic()
-        self._allowed.reload()
-        if self._allowed.revocations != self._revocations:
-            self._revocations = self._allowed.revocations
-            self._on_revoked()
-
-    def callback(self, domain: str, key: bytes) -> bool:
-        """Return whether a client may come in; called by the thread, with the key in Z85."""
-        permitted = self._allowed.permits(domain, key)
-        if not permitted:
-            self._tell_refused(domain, key.decode("ascii"))
-        return permitted
-
-    def _tell_refused(self, domain: str, key: str) -> None:
-        self._refused += 1
-        self._on_event(
-            "client_refused",
-            f"{self._authenticator.address} may not use the {domain}: its public key {key} is "
-            f"not allowed ({self._refused} refused so far)",
-            "if it is yours, copy its public key (CLIENT.key) to this computer, and "
-            + how_to_allow(self._clients, may_command=domain == CONTROL),
-        )
 
 
 class _Authenticator(ThreadAuthenticator):

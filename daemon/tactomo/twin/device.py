@@ -53,7 +53,7 @@ from tactomo.twin.firmware import (
     Converter,
     Firmware,
     Port,
-    SimulatedCompanions,
+    SimulatedCompanion,
     Voltages,
 )
 from tactomo.twin.foreign import Emulator, ForeignFirmware
@@ -165,7 +165,11 @@ class Twin:
             self._skin = skin or make_skin(config.description, config.unevenness, config.seed)
             self._drifting = DriftingSkin(self._skin, config.skin_drift, config.seed)
             undo.pop_all()
-        self._companions = SimulatedCompanions(config.description, config.seed)
+        sensor = config.description
+        self._companions = {
+            name: SimulatedCompanion(index, sensor.companion[name], config.seed)
+            for index, name in sensor.companion_indices.items()
+        }
         self._converter = self._make_converter()
         self._powered_s = time.monotonic()
         self._firmware = self._make_firmware(ports)
@@ -262,10 +266,10 @@ class Twin:
         return self._script.presses_at(max(0.0, time_s - self._started_s)) | self._live
 
     def _read_companions(self, time_s: float, counter: int) -> list[CompanionReading]:
-        if not self.config.description.companion:
+        if not self._companions:
             return []
         forces_n = self._skin.forces_n(self._presses_at(time_s))
-        return self._companions.read(forces_n, time_s, counter)
+        return [one.read(forces_n[k], time_s, counter) for k, one in self._companions.items()]
 
     def _play_at(self, time_s: float) -> None:
         """Start the scripted scene; it may say how the skin drifts."""

@@ -21,7 +21,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.sensor.companion import Companion
 from tactomo_protocol import (
@@ -41,28 +40,14 @@ from tactomo_protocol import (
 from tactomo.twin.line import SerialLine
 
 
-class SimulatedCompanions:
-    """All companions of a sensor: load cells and the like, which feel what presses the skin.
+@dataclass(eq=False)
+class SimulatedCompanion:
+    """A companion of a sensor: a load cell or the like, which feels what presses the skin.
 
     Noise, the gain's error, lag and dead time are those of the description; noise depends on
     nothing but the seed, the companion and the scan's counter. For one thread; time only goes on.
     """
 
-    def __init__(self, description: SensorDescription, seed: int) -> None:
-        self._each = {
-            name: _SimulatedCompanion(index, description.companion[name], seed)
-            for index, name in description.companion_indices.items()
-        }
-
-    def read(
-        self, forces_n: Mapping[str, float], time_s: float, counter: int
-    ) -> list[CompanionReading]:
-        """Return what each reads at a scan; `forces_n` are what presses on each then."""
-        return [each.read(forces_n[name], time_s, counter) for name, each in self._each.items()]
-
-
-@dataclass(eq=False)
-class _SimulatedCompanion:
     _index: int
     _companion: Companion
     _seed: int
@@ -75,6 +60,7 @@ class _SimulatedCompanion:
         self._seen_n, self._seen_s = 0.0, 0.0  # the force behind the lag, and when
 
     def read(self, force_n: float, time_s: float, counter: int) -> CompanionReading:
+        """Return what it reads at a scan, of the force that presses on it then."""
         companion = self._companion
         noise = np.random.default_rng([self._seed, self._index, counter, 3]).standard_normal()
         felt_n = self._gain * self._behind(force_n, time_s) + companion.noise_n * float(noise)

@@ -52,8 +52,8 @@ def test_what_the_page_is_drawn_from(grasp: Path) -> None:
         assert frames.description is not None
         figure = draw_page(course, maps, frames.description, "a grasp")
     assert list(course.tracks) == ["1", "2"]
-    assert len(course.tracks["1"].times_s) == LAST_PRESSED - FIRST_PRESSED - 2
-    assert course.tracks["2"].times_s[0] == pytest.approx(LIGHT_FROM * PERIOD_NS * 1e-9)
+    assert len(course.tracks["1"]) == LAST_PRESSED - FIRST_PRESSED - 2
+    assert course.tracks["2"][0][0] == pytest.approx(LIGHT_FROM * PERIOD_NS * 1e-9)
     assert sum(course.lost) == 2
     assert course.ages_s[0] == pytest.approx(0.007)
     assert len(maps) == 6
@@ -119,10 +119,8 @@ def test_a_sensor_without_magnitude_shows_areas(grasp: Path) -> None:
         course = read_course(frames)
         maps = read_maps(frames, course)
     for track in course.tracks.values():
-        track.contacts = [
-            replace(c, magnitude=None, pressure_kpa=None, force_n=None, pressure_range="unknown")
-            for c in track.contacts
-        ]
+        unknown: Any = dict.fromkeys(("magnitude", "pressure_kpa", "force_n"))
+        track[:] = [(t, replace(c, **unknown, pressure_range="unknown")) for t, c in track]
     figure = draw_page(course, maps, None, "a tank")
     assert "area (mm²)" in axes_labels(figure)
     assert "force (N)" not in axes_labels(figure)

@@ -66,10 +66,15 @@ class RecordedFrames:
         return (moment for moment in every if start_s <= moment.time_s < self.end_s)
 
     def _kept_moments(self, kind: Literal["map", "contacts"]) -> Iterator[TimedFrame]:
-        clock = _Clock(self.start_ns)
+        """Yield recorded frames, by the monotonic clock: the wall clock jumps."""
         window = {"start_s": max(0.0, self.start_s - MARGIN_S), "end_s": self.end_s + MARGIN_S}
+        session, zero_ns = "", 0
         for frame in self._given.frames(kind, **window):
-            yield TimedFrame(clock.time_s(frame), frame, frame.age_s)
+            if frame.session != session:  # another run of the daemon, maybe after a reboot
+                session = frame.session
+                since_start_ns = frame.acquired_realtime_ns - self.start_ns
+                zero_ns = frame.acquired_monotonic_ns - since_start_ns
+            yield TimedFrame((frame.acquired_monotonic_ns - zero_ns) * 1e-9, frame, frame.age_s)
 
     def _made_moments(self, kind: Literal["map", "contacts"]) -> Iterator[TimedFrame]:
         """Yield frames that were made of a replay, which knows its own times only."""
@@ -94,22 +99,6 @@ class RecordedFrames:
             for moment in moments:
                 show(moment.time_s - self.start_s, max(length_s, 1e-9))
                 yield moment
-
-
-class _Clock:
-    """Seconds since the recording's beginning, by the monotonic clock: the wall clock jumps."""
-
-    def __init__(self, start_ns: int) -> None:
-        self._start_ns = start_ns
-        self._session = ""
-        self._zero_ns = 0
-
-    def time_s(self, frame: Frame) -> float:
-        if frame.session != self._session:  # another run of the daemon, maybe after a reboot
-            self._session = frame.session
-            since_start_ns = frame.acquired_realtime_ns - self._start_ns
-            self._zero_ns = frame.acquired_monotonic_ns - since_start_ns
-        return (frame.acquired_monotonic_ns - self._zero_ns) * 1e-9
 
 
 def _arrivals(path: Path) -> Iterator[tuple[int, int]]:
@@ -142,16 +131,21 @@ def recorded_frames(
     from tactomo_client.recording import open_recording
     from tactomo_models import load_description
 
+    from tactomo.recordings.recording import open_recording as open_bytes
+
     if end_s is not None and end_s <= start_s:
         raise typer.BadParameter(f"--to {end_s:g} is not after --from {start_s:g}")
     given = open_recording(path)
     known = None
     try:
-        known = load_description(description) if description else _carried(given)
+        origin = open_bytes(given.files[0]).origin
+        known = load_description(description) if description else origin.read_description()
     except RecordingError:
         if not given.has_frames:
             raise
-    with _reported_warnings(), contextlib.ExitStack() as undo:
+    with warnings.catch_warnings(), contextlib.ExitStack() as undo:
+        # What a recording lacks is reported on standard error, each thing once.
+        warnings.showwarning = lambda message, *_, **__: say(str(message), err=True)
         remade: list[Recording] = []
         if not given.has_frames or description:
             folder = undo.enter_context(
@@ -169,20 +163,6 @@ def recorded_frames(
             given,
             remade,
         )
-
-
-@contextlib.contextmanager
-def _reported_warnings() -> Iterator[None]:
-    """Report on standard error what a recording lacks, each thing once."""
-    with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *_, **__: say(str(message), err=True)
-        yield
-
-
-def _carried(given: Recording) -> SensorDescription:
-    from tactomo.recordings.recording import open_recording
-
-    return open_recording(given.files[0]).origin.read_description()
 
 
 def _reconstructed(given: Recording, known: SensorDescription, folder: Path) -> list[Recording]:

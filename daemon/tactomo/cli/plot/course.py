@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from tactomo.cli.files.recorded_frames import RecordedFrames, TimedFrame, missing
 
@@ -11,15 +11,9 @@ if TYPE_CHECKING:
     from tactomo_client import Contact
 
 MAPS_SHOWN: Final = 6
+Track: TypeAlias = "list[tuple[float, Contact]]"
+"""One contact over time: when, in seconds, and how it was then."""
 SHORTEST_S: Final = 0.15  # stretches shorter than this are not shown, unless there is no other
-
-
-@dataclass(slots=True)
-class Track:
-    """One contact over time; `contacts[i]` is how it was at `times_s[i]`."""
-
-    times_s: list[float] = field(default_factory=list)
-    contacts: list[Contact] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -43,6 +37,11 @@ class Course:
     tracks: dict[str, Track] = field(default_factory=dict)
     """Contacts by identity, in the order in which they came."""
 
+    @property
+    def contacts(self) -> list[Contact]:
+        """All contacts of all frames."""
+        return [contact for track in self.tracks.values() for _, contact in track]
+
 
 def read_course(frames: RecordedFrames) -> Course:
     """Read the frames of a recording without their images."""
@@ -62,9 +61,8 @@ def read_course(frames: RecordedFrames) -> Course:
         course.lost.append(lost)
         course.left_out.append(max(0, missing(last, moment, "scan_counter") - lost))
         for contact in frame.contacts:
-            track = course.tracks.setdefault(f"{contact.id}{run}", Track())
-            track.times_s.append(moment.time_s)
-            track.contacts.append(contact)
+            track = course.tracks.setdefault(f"{contact.id}{run}", [])
+            track.append((moment.time_s, contact))
         last = moment
     return course
 

@@ -76,10 +76,9 @@ def _subtitle(course: Course) -> str:
 
 
 def _has_data(panel: str, course: Course) -> bool:
-    contacts = [contact for track in course.tracks.values() for contact in track.contacts]
     if panel == "force":
-        return any(contact.force_n is not None for contact in contacts)
-    return bool(contacts) or panel != "pressure"
+        return any(contact.force_n is not None for contact in course.contacts)
+    return bool(course.tracks) or panel != "pressure"
 
 
 def _contact_colours(course: Course) -> dict[str, Any]:
@@ -168,9 +167,10 @@ def _draw_path(
     if description is not None:
         _draw_sheet(axes, description)
     for index, (name, track) in enumerate(course.tracks.items()):
-        last = track.contacts[-1].x_mm, track.contacts[-1].y_mm
+        _, last = track[-1]
         aside = 7 + 10 * (index % 4), 5  # of tracks that end at one place each name is read
-        axes.annotate(name, last, aside, textcoords="offset points", color=colours[name])
+        at = last.x_mm, last.y_mm
+        axes.annotate(name, at, aside, textcoords="offset points", color=colours[name])
         _draw_track(axes, track, colours[name])
     axes.set(aspect="equal", xlabel="x (mm)", ylabel="y (mm)")
     axes.set_title("path, from ○ to ●; dots by area", fontsize=10)
@@ -187,9 +187,9 @@ def _draw_sheet(axes: Any, description: SensorDescription) -> None:
 
 
 def _draw_track(axes: Any, track: Track, colour: Any) -> None:
-    x = [contact.x_mm for contact in track.contacts]
-    y = [contact.y_mm for contact in track.contacts]
-    sizes = [max(4.0, contact.area_mm2 / 25) for contact in track.contacts]
+    x = [contact.x_mm for _, contact in track]
+    y = [contact.y_mm for _, contact in track]
+    sizes = [max(4.0, contact.area_mm2 / 25) for _, contact in track]
     axes.scatter(x, y, s=sizes, color=colour, alpha=0.12, linewidths=0, rasterized=True)
     axes.plot(x, y, color=colour, linewidth=1.2)
     axes.plot(x[0], y[0], "o", color=colour, markerfacecolor="white", markersize=7)
@@ -227,7 +227,7 @@ def _draw_rows(
 
 
 def _draw_pressure(axes: Any, course: Course, colours: dict[str, Any]) -> None:
-    contacts = [contact for track in course.tracks.values() for contact in track.contacts]
+    contacts = course.contacts
     if any(c.pressure_kpa is not None or c.pressure_range == "below" for c in contacts):
         _draw_quantity(axes, course, colours, "pressure_kpa", "pressure_sigma_kpa")
         _draw_light(axes, course, colours)
@@ -246,7 +246,7 @@ def _draw_light(axes: Any, course: Course, colours: dict[str, Any]) -> None:
     across = axes.get_xaxis_transform()
     lights = 0
     for name, track in course.tracks.items():
-        light = [t for t, c in _pairs(track) if c.pressure_range == "below"]
+        light = [t for t, c in track if c.pressure_range == "below"]
         if light:
             height = 0.05 + 0.06 * (lights % 4)
             lights += 1
@@ -277,7 +277,7 @@ def _draw_quantity(
     Lower bounds of pressures and forces are marks without a line.
     """
     for identity, track in course.tracks.items():
-        known = [(t, c) for t, c in _pairs(track) if getattr(c, name) is not None]
+        known = [(t, c) for t, c in track if getattr(c, name) is not None]
         times = [t for t, _ in known]
         values = [None if _is_bound(c, name) else getattr(c, name) for _, c in known]
         bounds = [(t, getattr(c, name)) for t, c in known if _is_bound(c, name)]
@@ -296,10 +296,6 @@ def _draw_quantity(
 def _is_bound(contact: Contact, name: str) -> bool:
     """Whether a pressure or force is a lower bound."""
     return name in ("pressure_kpa", "force_n") and contact.pressure_range == "above"
-
-
-def _pairs(track: Track) -> list[tuple[float, Contact]]:
-    return list(zip(track.times_s, track.contacts, strict=True))
 
 
 def _broken(times: Sequence[float], values: Iterable[Any]) -> tuple[Any, Any]:
