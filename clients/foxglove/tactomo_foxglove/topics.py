@@ -36,10 +36,6 @@ def _list(of: dict[str, Any]) -> dict[str, Any]:
     return {"type": "array", "items": of}
 
 
-def _numbers(*names: str) -> dict[str, Any]:
-    return dict.fromkeys(names, _NUMBER)
-
-
 _JSON: Final = {
     **{"int": _INTEGER, "Unsigned": _INTEGER, "str": _TEXT, "bool": _TRUTH},
     "tuple[float, float, float]": _list(_NUMBER),
@@ -63,7 +59,7 @@ FRAME_SCHEMA: Final = {
     **_object(
         **_fields(Frame, *FRAME_NUMBERS),
         **dict.fromkeys(("flag_count", "contact_count", "missed_frames"), _INTEGER),
-        **_numbers("age_ms", "delay_ms", "period_ms", "pressure_max_kpa"),
+        **dict.fromkeys(("age_ms", "delay_ms", "period_ms", "pressure_max_kpa"), _NUMBER),
         contacts=_list(_object(**_fields(Contact), trace=_INTEGER)),
     ),
 }

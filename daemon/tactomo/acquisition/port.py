@@ -171,7 +171,8 @@ class PortReader(Worker):
         if data:
             self._take(data, realtime_ns, monotonic_ns, source.clock_ns(monotonic_ns))
         if source.has_ended and not self.has_ended:
-            self._end()
+            self.has_ended = True
+            self._deliver(PortRead(self.index, 0, (), has_ended=True, replay_pass=self._pass))
         if self._playback is None and self.connection.is_open:
             self._attend(monotonic_ns * 1e-9)
 
@@ -254,7 +255,8 @@ class PortReader(Worker):
         if self._playback is None:
             self._send(self.protocol.replies())
         self._tell_corrupt()
-        self._tell_faulty(now_s)
+        if self._has_risen("faulty", self.protocol.counts.faulty) and self.protocol.fault:
+            self._note_fault(self.protocol.fault, now_s)
         self._tell_clock()
         self._tell_protocols_trouble()
 
@@ -448,10 +450,6 @@ class PortReader(Worker):
         elif not trouble and not self.refusal and state is not DeviceState.STARTING:
             self._tell("device_speaks")
 
-    def _end(self) -> None:
-        self.has_ended = True
-        self._deliver(PortRead(self.index, 0, (), has_ended=True, replay_pass=self._pass))
-
     def _begin_pass(self, number: int) -> None:
         """Go on elsewhere in the recording: what had begun to come is not finished."""
         self._pass, self.has_ended = number, False
@@ -501,10 +499,6 @@ class PortReader(Worker):
                 f"{corrupt} damaged since the start",
                 "check the cable, its shield and the baud rate",
             )
-
-    def _tell_faulty(self, now_s: float) -> None:
-        if self._has_risen("faulty", self.protocol.counts.faulty) and self.protocol.fault:
-            self._note_fault(self.protocol.fault, now_s)
 
 
 def unlike_hello(scan: Scan, hello: Hello) -> str:

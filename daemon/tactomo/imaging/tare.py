@@ -233,13 +233,9 @@ def movement_and_noise(scans: Volts) -> tuple[float, float]:
     trend (von Neumann); what the variance has beyond it is movement. Both are relative to the
     voltages, rms over the measurements.
     """
-    relative = scans / _size(scans.mean(axis=0))
+    size = np.abs(scans.mean(axis=0))
+    least = max(size.max() * SMALLEST_SHARE, np.finfo(float).tiny)
+    relative = scans / np.maximum(size, least)  # small voltages count for no more than larger ones
     noise = 0.5 * np.mean(np.diff(relative, axis=0) ** 2)
     movement = np.mean(relative.var(axis=0, ddof=1)) - noise
     return float(np.sqrt(max(movement, 0.0))), float(np.sqrt(noise))
-
-
-def _size(volts: Volts) -> Volts:
-    """What changes (M,) are relative to: small voltages do not count for more than larger ones."""
-    size = np.abs(volts)
-    return np.maximum(size, max(size.max() * SMALLEST_SHARE, np.finfo(float).tiny))

@@ -39,7 +39,6 @@ from tactomo.twin.control import (
     COMMANDS,
     ControlSocket,
     GarbageArguments,
-    Handler,
     MuteArguments,
     NoiseArguments,
     PlayArguments,
@@ -156,7 +155,9 @@ class Twin:
         self._live: dict[str, Indenter] = {}  # what clients press, by id
         with contextlib.ExitStack() as undo:
             # What may be taken comes first: nobody likes to wait for a mesh to be told that.
-            self._control = ControlSocket(config.control, self._handlers())
+            self._control = ControlSocket(
+                config.control, {command: getattr(self, f"_{command}") for command in COMMANDS}
+            )
             undo.callback(self._control.close)
             ports = []
             for line, channels in _wiring(config).items():
@@ -305,9 +306,6 @@ class Twin:
             noise_v=NOISE_SHARE * largest_v if noise_v is None else noise_v,
             seed=self.config.seed,
         )
-
-    def _handlers(self) -> dict[str, Handler]:
-        return {command: getattr(self, f"_{command}") for command in COMMANDS}
 
     def _status(self, _: Nothing) -> dict[str, Any]:
         firmware = self._firmware

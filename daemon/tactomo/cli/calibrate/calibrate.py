@@ -194,7 +194,9 @@ def reload(
     keys: options.KeysFolder = None,
 ) -> None:
     """Make the running daemon read its calibration file again."""
-    say(reload_kept(sensor, address, keys))
+    there = find_commanded(sensor, address, keys)
+    found = _reloaded(there.control, keys)
+    say(f"in force now: the daemon of {there.sensor} goes by {_words(found)}")
 
 
 def _area_mm2(diameter_mm: float | None, area_mm2: float | None) -> float | None:
@@ -217,7 +219,13 @@ def print_calibration(made: PressureCalibration) -> None:
     console.print(f"{made.subject.sensor}: {made.words}", soft_wrap=True, highlight=False)
     console.print(_table(made))
     console.print("; ".join(_facts(made)) + ".", soft_wrap=True, highlight=False)
-    console.print(_beyond(made), soft_wrap=True, highlight=False)
+    low, high = made.curve.range_kpa
+    console.print(
+        f"Below {low:.0f} kPa contacts are `below` (touched, pressure unknown); beyond {high:.0f} "
+        "kPa they are `above` (a lower bound).",
+        soft_wrap=True,
+        highlight=False,
+    )
 
 
 def _table(made: PressureCalibration) -> Table:
@@ -243,14 +251,6 @@ def _facts(made: PressureCalibration) -> list[str]:
         else f"falling loads read {hysteresis:+.1f} kPa against rising ones",
         f"of {', '.join(made.subject.device_ids) or 'any device'}, as {made.subject.description}",
     ]
-
-
-def _beyond(made: PressureCalibration) -> str:
-    low, high = made.curve.range_kpa
-    return (
-        f"Below {low:.0f} kPa contacts are `below` (touched, pressure unknown); beyond {high:.0f} "
-        "kPa they are `above` (a lower bound)."
-    )
 
 
 MARKERS = {"up": "^", "down": "v", "unknown": "o"}
@@ -301,13 +301,6 @@ def draw_calibration(made: PressureCalibration, output: Path) -> None:
 
 
 CONNECT_S: Final = 1.0  # how long to wait where nobody listens: there need not be a daemon
-
-
-def reload_kept(name: str | None, address: str | None, keys: Path | None) -> str:
-    """Have the daemon of a sensor read its calibration again; return in words what is in force."""
-    there = find_commanded(name, address, keys)
-    found = _reloaded(there.control, keys)
-    return f"in force now: the daemon of {there.sensor} goes by {_words(found)}"
 
 
 def keep(

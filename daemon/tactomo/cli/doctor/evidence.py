@@ -217,13 +217,13 @@ def of_recording(recording: Recording, description: str | None, frames: slice | 
     ports = [_scans_of_port(recording, n) for n in range(len(recording.origin.ports))]
     scans = {}
     for channel in known.channels:
-        taken = [scan for port in ports for scan in port if scan.channel is channel]
+        taken = [each for port in ports for each in port if each.scan.channel is channel]
         taken = taken if frames is None else taken[frames]
         if taken:
             scans[str(channel)] = Scans(
-                np.array([scan.volts for scan in taken]),
-                _times([(scan.device_us, scan.arrived_ns) for scan in taken]),
-                sum(bool(scan.flags & ScanFlag.SATURATED) for scan in taken),
+                np.array([each.volts for each in taken]),
+                _times([(each.scan.device_us, each.arrived_ns) for each in taken]),
+                sum(bool(each.scan.flags & ScanFlag.SATURATED) for each in taken),
             )
     if not scans:
         raise TactomoError(
@@ -238,10 +238,7 @@ def of_recording(recording: Recording, description: str | None, frames: slice | 
 
 
 class _Taken(NamedTuple):
-    channel: Channel
-    counter: int
-    device_us: int
-    flags: ScanFlag
+    scan: Scan
     volts: FloatArray
     arrived_ns: int
 
@@ -254,14 +251,16 @@ def _scans_of_port(recording: Recording, port: int) -> list[_Taken]:
             hello = packet
         elif isinstance(packet, Scan) and hello is not None:
             volts = bounded(packet.volts(hello.volts_per_count))
-            kept = (packet.channel, packet.counter, packet.device_us, packet.flags)
-            scans.append(_Taken(*kept, volts, clock_ns))
+            scans.append(_Taken(packet, volts, clock_ns))
     return scans
 
 
 def _heard_on_ports(recording: Recording, ports: list[list[_Taken]]) -> Heard:
-    channels = [(port, channel) for port in ports for channel in {scan.channel for scan in port}]
-    lost = [_gaps([s.counter for s in port if s.channel is channel]) for port, channel in channels]
+    lost = [
+        _gaps([taken.scan.counter for taken in port if taken.scan.channel is channel])
+        for port in ports
+        for channel in Channel
+    ]
     summary = recording.summary
     return Heard(summary.packets, summary.corrupt, summary.faulty, max(lost, default=0))
 

@@ -185,7 +185,7 @@ def write_dataset(
     held = list(_up_to_first_map(moments))
     if not held:
         return 0, []
-    touch = Touch(_shape(held[-1]))
+    touch = Touch(_image(held[-1]).shape)
     alignment = Alignment(_clock(log, gaps))
     rate = fps or _rate(log)
     start_s = alignment.published_s(held[0])
@@ -237,11 +237,6 @@ def _up_to_first_map(moments: Iterator[TimedFrame]) -> Iterator[TimedFrame]:
 def _image(moment: TimedFrame) -> Any:
     images = (moment.frame.pressure_kpa, moment.frame.map, moment.frame.structure)
     return next((image for image in images if image is not None), None)
-
-
-def _shape(moment: TimedFrame) -> tuple[int, int]:
-    rows, columns = _image(moment).shape
-    return rows, columns
 
 
 def _rate(log: RobotLog | None) -> int:

@@ -267,7 +267,7 @@ def import_scans(
     from tactomo.recordings.recording_writer import write_recording
 
     reference = frame_slice(reference_frames)
-    measured = load_description(description)
+    measured, path = load_description(description), Path(description)
     known = None if channel is None else Channel(channel)
     read = read_scans(scans, measured, known)
     times_s = read.times(rate)
@@ -279,7 +279,8 @@ def import_scans(
             read.hello(measured, float(mean_rate_hz)),
             bar.track(read.packets(times_s, measured), total, description="importing"),
             sensor=sensor,
-            description=_portable(description),
+            # a shipped one's name, or a path that holds wherever the recording goes
+            description=str(path.absolute()) if path.exists() else description,
             description_sha256=measured.sha256,
             description_text=carried_text(measured, description),
             reference=read.reference_of(reference),
@@ -290,9 +291,3 @@ def import_scans(
         f"{recording}: {read.count} scans in {times_s[-1]:.1f} s "
         f"({mean_rate_hz:.1f}/s), {length / 1e6:.2f} MB"
     )
-
-
-def _portable(description: str) -> str:
-    """Return a description's name as it is, and its path made absolute."""
-    path = Path(description)
-    return str(path.absolute()) if path.exists() else description
