@@ -8,7 +8,6 @@ lets in the allowed clients only.
 
 from __future__ import annotations
 
-import ipaddress
 import os
 import resource
 import socket as posix_socket
@@ -21,6 +20,7 @@ from typing import Final
 from urllib.parse import urlsplit
 
 import zmq
+from tactomo_client.connection import is_loopback
 
 from tactomo.errors import AddressError
 
@@ -64,11 +64,7 @@ def check_endpoint(endpoint: str) -> str:
 
 def is_local(endpoint: str) -> bool:
     """Whether an endpoint can be reached from its own computer alone."""
-    host = urlsplit(endpoint).hostname or ""
-    try:
-        return endpoint.startswith(IPC) or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
+    return endpoint.startswith(IPC) or is_loopback(urlsplit(endpoint).hostname or "")
 
 
 def next_address(address: str, steps: int = 1) -> str:

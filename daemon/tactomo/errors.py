@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 
@@ -36,7 +36,9 @@ def needs(what: str, install: str) -> Iterator[None]:
 
 
 @contextmanager
-def os_errors_as(kind: type[TactomoError], cause: str, next_step: str) -> Iterator[None]:
+def os_errors_as(
+    kind: Callable[[str, str], Exception], cause: str, next_step: str
+) -> Iterator[None]:
     """Raise `kind` where the operating system refuses what a block does, with its reason."""
     try:
         yield

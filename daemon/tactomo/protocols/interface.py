@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar, Final, NamedTuple
 
 import numpy as np
-from tactomo_models.arrays import FloatArray
+from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_protocol import (
     MAX_DEVICE_US,
     MAX_SAMPLES,
@@ -57,6 +57,13 @@ def check_scan_fits(description: SensorDescription) -> None:
             "list fewer drive or measuring pairs in its [pattern]; files of any number of voltages "
             "are reconstructed by tactomo reconstruct",
         )
+
+
+def oriented(pairs: IntArray) -> dict[tuple[int, int], tuple[int, int]]:
+    """Return each pair's row and the sign 1; of a pair that is exchanged, the sign is -1."""
+    rows = list(enumerate(pairs.tolist()))
+    exchanged = {(b, a): (row, -1) for row, (a, b) in rows}
+    return exchanged | {(a, b): (row, 1) for row, (a, b) in rows}
 
 
 TWIN_ID: Final = "twin-"

@@ -51,7 +51,7 @@ from numpy.typing import NDArray
 from tactomo_models import SensorDescription
 
 from tactomo.errors import ConfigError
-from tactomo.protocols.interface import ForeignProtocol, Reading, Trouble
+from tactomo.protocols.interface import ForeignProtocol, Reading, Trouble, oriented
 from tactomo.scans import MAX_QUADRATURE
 
 AMPLITUDE_A: Final = (100e-9, 10e-3)
@@ -142,8 +142,7 @@ class Sciospec(ForeignProtocol):
         drives = description.drive_pairs
         self.patience_s = self._usual_patience_s = max(4.0, 3 / description.instrument.scan_rate_hz)
         self._groups = -(-description.electrode_count // CHANNELS)
-        self._sinks = {(b, a): (row, -1) for row, (a, b) in enumerate((drives + 1).tolist())}
-        self._sinks |= {(a, b): (row, 1) for row, (a, b) in enumerate((drives + 1).tolist())}
+        self._sinks = oriented(drives + 1)
         row_of = {tuple(pair): row for row, pair in enumerate(drives.tolist())}
         self._rows = np.array([row_of[tuple(pair)] for pair in description.pairs.drive.tolist()])
         self._buffer = b""

@@ -32,7 +32,7 @@ from tactomo_models.sensor.pattern import rim_signs, touching
 from tactomo_protocol import Channel, CompanionReading, Hello, Scan, ScanFlag
 
 from tactomo.errors import TactomoError, os_errors_as
-from tactomo.protocols.interface import hello_of
+from tactomo.protocols.interface import hello_of, oriented
 from tactomo.recordings.eit_files import SUFFIX, eit_files, read_eit_files
 from tactomo.scans import MAX_QUADRATURE
 
@@ -377,8 +377,7 @@ def _injection_rows(
     path: Path, injection: NDArray[np.int_], description: SensorDescription
 ) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
     """Return, for each voltage, its row in the file and the sign of the current there."""
-    where = {(sink, source): (row, -1) for row, (source, sink) in enumerate(injection.tolist())}
-    where |= {(source, sink): (row, 1) for row, (source, sink) in enumerate(injection.tolist())}
+    where = oriented(injection)
     wanted = [tuple(pair) for pair in description.pairs.drive.tolist()]
     missing = sorted(set(wanted) - where.keys())
     if missing:

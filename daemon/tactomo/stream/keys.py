@@ -21,9 +21,12 @@ from tactomo_client.errors import KeysError
 from tactomo_client.keys import PUBLIC_SUFFIX, SECRET_SUFFIX, read_public
 from tactomo_client.messages import check_sensor_name
 
+from tactomo.errors import os_errors_as
+
 CLIENTS_SUFFIX: Final = ".clients"
 MAY_COMMAND: Final = "may_command"
 SYSTEM_FOLDER: Final = Path("/etc/tactomo/keys")
+OWN_FOLDER: Final = "name a folder of yours with --keys, or run this with sudo"
 
 
 @dataclass(frozen=True)
@@ -82,14 +85,12 @@ def make_pair(folder: Path, name: str, *, is_server: bool = False, force: bool =
             "keys_exist",
         )
     public, secret = (key.decode("ascii") for key in zmq.curve_keypair())
-    try:
+    with os_errors_as(KeysError, f"cannot write to {folder}", OWN_FOLDER):
         folder.mkdir(mode=0o755, parents=True, exist_ok=True)
         _write(secret_file, _text(public, secret), 0o600)
         _write(public_file, _text(public), 0o644)
         if is_server:
             (clients_folder(folder, name) / MAY_COMMAND).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _cannot_write(folder, error) from error
 
 
 def allow(
@@ -123,12 +124,10 @@ def allow(
         )
     readers, commanders = _places(folder, server, client.name)
     keep, drop = (commanders, readers) if may_command else (readers, commanders)
-    try:
+    with os_errors_as(KeysError, f"cannot write to {keep.parent}", OWN_FOLDER):
         keep.parent.mkdir(parents=True, exist_ok=True)
         _write(keep, _text(key), 0o644)
         drop.unlink(missing_ok=True)
-    except OSError as error:
-        raise _cannot_write(keep.parent, error) from error
     return client
 
 
@@ -142,11 +141,9 @@ def revoke(folder: Path, name: str, server: str) -> None:
     if not places:
         known = ", ".join(client.name for client in list_clients(folder, server)) or "nobody"
         raise KeysError(f"{name!r} is not on the list of {server!r}", f"on it: {known}")
-    try:
+    with os_errors_as(KeysError, f"cannot write to {places[0].parent}", OWN_FOLDER):
         for path in places:
             path.unlink()
-    except OSError as error:
-        raise _cannot_write(places[0].parent, error) from error
 
 
 def list_clients(folder: Path, server: str) -> list[Client]:
@@ -212,10 +209,3 @@ def _write(path: Path, text: str, mode: int) -> None:
     except BaseException:
         Path(part).unlink(missing_ok=True)
         raise
-
-
-def _cannot_write(folder: Path, error: OSError) -> KeysError:
-    return KeysError(
-        f"cannot write to {folder}: {error.strerror}",
-        "name a folder of yours with --keys, or run this with sudo",
-    )

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray
 
+from tactomo.protocols.interface import oriented
 from tactomo.protocols.sciospec import (
     ACK_TAG,
     AMPLITUDE_A,
@@ -40,7 +41,7 @@ class SciospecEmulator(Emulator):
 
     def __init__(self, description: SensorDescription, rate_hz: float) -> None:
         super().__init__(description, rate_hz)
-        self._drives = {tuple(pair): row for row, pair in enumerate(_drives(description))}
+        self._drives = oriented(description.drive_pairs + 1)
         self._buffer = b""
         self._heard_s = 0.0
         self._obey: Mapping[int, Callable[[bytes], bool]] = {
@@ -166,13 +167,10 @@ class SciospecEmulator(Emulator):
         if len(content) != 2:
             return False
         source, sink = content
-        forth = self._drives.get((source - 1, sink - 1))
-        back = self._drives.get((sink - 1, source - 1))
-        if forth is not None:
-            self._injections[source, sink] = (forth, 1)
-        elif back is not None:
-            self._injections[source, sink] = (back, -1)
-        return forth is not None or back is not None
+        place = self._drives.get((source, sink))
+        if place is not None:
+            self._injections[source, sink] = place
+        return place is not None
 
 
 def _ack(code: Ack) -> bytes:
@@ -184,7 +182,3 @@ def _number(form: str, content: bytes) -> float:
     if len(content) != struct.calcsize(form):
         return float("nan")
     return float(struct.unpack(form, content)[0])
-
-
-def _drives(description: SensorDescription) -> list[tuple[int, int]]:
-    return [(int(source), int(sink)) for source, sink in description.drive_pairs]
