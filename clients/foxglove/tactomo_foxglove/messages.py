@@ -151,18 +151,20 @@ def contacts_scene(
     """
     at = to_timestamp(time_ns)
     everything = fox.SceneEntityDeletion(timestamp=at, type=fox.SceneEntityDeletionType.All)
-    entities = [
-        fox.SceneEntity(
-            timestamp=at,
-            frame_id=contact.frame or frame.sensor,
-            id=f"contact {contact.id}",
-            metadata=_metadata(contact),
-            cylinders=[_disc(contact, description, stale)],
-            arrows=_force_arrow(contact, description, stale),
-            texts=[_floating_label(contact, description, stale)],
+    entities = []
+    for contact in frame.contacts:
+        above = _above(contact, disc_height_m(contact, description) + 0.006)
+        entities.append(
+            fox.SceneEntity(
+                timestamp=at,
+                frame_id=contact.frame or frame.sensor,
+                id=f"contact {contact.id}",
+                metadata=_metadata(contact),
+                cylinders=[_disc(contact, description, stale)],
+                arrows=_force_arrow(contact, description, stale),
+                texts=[_text(label(contact), above, GREY if stale else WHITE, 12.0)],
+            )
         )
-        for contact in frame.contacts
-    ]
     if stale:
         height_mm = float(description.get("height_mm") or 150.0)
         (point,) = _points(description, np.array([(0.0, 0.6 * height_mm)])).tolist()
@@ -190,13 +192,6 @@ def _disc(contact: Contact, description: Mapping[str, Any], stale: str) -> fox.C
         top_scale=1.0,
         color=_disc_colour(contact, description, stale),
     )
-
-
-def _floating_label(
-    contact: Contact, description: Mapping[str, Any], stale: str
-) -> fox.TextPrimitive:
-    above = _above(contact, disc_height_m(contact, description) + 0.006)
-    return _text(label(contact), above, GREY if stale else WHITE, 12.0)
 
 
 def _force_arrow(

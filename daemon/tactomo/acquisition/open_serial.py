@@ -21,7 +21,7 @@ from typing import Final
 import serial
 
 from tactomo.acquisition import adapters
-from tactomo.errors import PortAbsentError, PortBusyError, PortError, TactomoError
+from tactomo.errors import PortAbsentError, PortBusyError, PortError
 
 READ_TIMEOUT_S: Final = 0.1
 """How long a read waits for its first byte, so how soon a reader notices that it should stop."""
@@ -45,8 +45,6 @@ def open_serial(url: str, baud: int) -> serial.Serial:
             write_timeout=WRITE_TIMEOUT_S,
             exclusive=True,
         )
-    except TactomoError:
-        raise
     except DEVICE_GONE as error:
         raise _explain(url, baud, error) from error
     if is_path(url):

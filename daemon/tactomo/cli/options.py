@@ -100,7 +100,8 @@ def _protocol(default: str = "") -> Any:
     )
 
 
-def _description(default: str = "") -> Any:
+def description_option(default: str = "") -> Any:
+    """Return the option --description; `default` says what counts without the option."""
     words = f"Sensor description: a shipped name or a TOML file.{default}"
     return typer.Option("--description", "-d", help=words, autocompletion=description_names)
 
@@ -109,9 +110,9 @@ Method: TypeAlias = Annotated[str, method_option()]
 GivenMethod: TypeAlias = Annotated[str | None, method_option(" [auto]")]
 Protocol: TypeAlias = Annotated[str, _protocol()]
 GivenProtocol: TypeAlias = Annotated[str | None, _protocol(" [tactomo]")]
-Description: TypeAlias = Annotated[str, _description()]
-GivenDescription: TypeAlias = Annotated[str | None, _description(f" [{DEFAULT_DESCRIPTION}]")]
-RecordedDescription: TypeAlias = Annotated[str | None, _description(" [the recorded one]")]
+Description: TypeAlias = Annotated[str, description_option()]
+GivenDescription: TypeAlias = Annotated[str | None, description_option(f" [{DEFAULT_DESCRIPTION}]")]
+RecordedDescription: TypeAlias = Annotated[str | None, description_option(" [the recorded one]")]
 ReferenceFrames: TypeAlias = Annotated[
     str | None, typer.Option(metavar="FIRST:END", help="Unpressed frames, from 0: the reference.")
 ]
@@ -176,6 +177,12 @@ Announce: TypeAlias = Annotated[
     ),
 ]
 Rate: TypeAlias = Annotated[float, typer.Option(help="Dual scans a second.")]
+DeviceIds: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--device-id", help="Device of the calibration; repeat. [the recording's, or any]"
+    ),
+]
 KeptFile: TypeAlias = Annotated[
     Path | None,
     typer.Option(

@@ -21,7 +21,7 @@ from tactomo.errors import CommandError
 from tactomo.stream.commands import Arguments, Nothing, obey
 from tactomo.twin.scene import Indenter, Scene, SkinDriftSettings
 
-Handler = Callable[[Any], Mapping[str, Any]]
+Handler = Callable[[Any], Mapping[str, Any] | None]
 PressId = Annotated[str, Field(min_length=1, max_length=64, coerce_numbers_to_str=True)]
 
 
@@ -113,6 +113,7 @@ class ControlSocket:
     def _reply(self, data: bytes) -> bytes:
         try:
             command, arguments = decode_request(data)
-            return encode_reply(obey(command, arguments, COMMANDS, self._handlers))
+            told: Mapping[str, Any] | None = obey(command, arguments, COMMANDS, self._handlers)
+            return encode_reply(told or {})
         except (MessageError, CommandError) as error:
             return encode_error(error.name, error.cause, error.next_step)

@@ -330,10 +330,9 @@ class Twin:
             ]
         }
 
-    def _press(self, arguments: PressArguments) -> dict[str, Any]:
+    def _press(self, arguments: PressArguments) -> None:
         self._check_touches(arguments)
         self._live[arguments.id] = arguments
-        return {}
 
     def _check_touches(self, arguments: PressArguments) -> None:
         """Refuse a press that lies off the sheet altogether: a slip, and nothing would tell."""
@@ -351,9 +350,8 @@ class Twin:
     def _release(self, arguments: ReleaseArguments) -> dict[str, Any]:
         return {"released": self._live.pop(arguments.id, None) is not None}
 
-    def _clear(self, _: Nothing) -> dict[str, Any]:
+    def _clear(self, _: Nothing) -> None:
         self._live.clear()
-        return {}
 
     def _play(self, arguments: PlayArguments) -> dict[str, Any]:
         self._script = arguments.scene or self._script
@@ -362,15 +360,13 @@ class Twin:
         self._play_at(self._clock())
         return {"length_s": self._script.length_s}
 
-    def _noise(self, arguments: NoiseArguments) -> dict[str, Any]:
+    def _noise(self, arguments: NoiseArguments) -> None:
         self._converter.noise_v = arguments.noise_v
-        return {}
 
-    def _drift(self, arguments: SkinDriftSettings) -> dict[str, Any]:
+    def _drift(self, arguments: SkinDriftSettings) -> None:
         self._drifting.drift = arguments.skin_drift(self._drifting.drift)
-        return {}
 
-    def _mute(self, arguments: MuteArguments) -> dict[str, Any]:
+    def _mute(self, arguments: MuteArguments) -> None:
         channels = self.config.description.channels
         if arguments.channel not in channels:
             raise CommandError(
@@ -379,17 +375,14 @@ class Twin:
                 name="bad_argument",
             )
         self._firmware.mute(Channel(arguments.channel), arguments.seconds)
-        return {}
 
-    def _garbage(self, arguments: GarbageArguments) -> dict[str, Any]:
+    def _garbage(self, arguments: GarbageArguments) -> None:
         for port in self._some_ports(arguments.port):
             self._firmware.babble(port, arguments.count)
-        return {}
 
-    def _unplug(self, arguments: PortArguments) -> dict[str, Any]:
+    def _unplug(self, arguments: PortArguments) -> None:
         for port in self._some_ports(arguments.port):
             port.line.unplug()
-        return {}
 
     def _replug(self, arguments: PortArguments) -> dict[str, Any]:
         for port in self._some_ports(arguments.port):

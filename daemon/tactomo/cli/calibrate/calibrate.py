@@ -118,10 +118,7 @@ def fit(
         float, typer.Option(metavar="SECONDS", help="Added to the load cell's times.")
     ] = 0.0,
     description: options.GivenDescription = None,
-    device_id: Annotated[
-        list[str] | None,
-        typer.Option(help="Device of the calibration, without a recording; repeat."),
-    ] = None,
+    device_id: options.DeviceIds = None,
     picture: Picture = None,
     output: options.KeptFile = None,
     dry_run: options.DryRun = False,

@@ -81,9 +81,7 @@ def fit(
     presses: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Presses (format above).")],
     sensor: options.Sensor = None,
     description: options.Description = options.DEFAULT_DESCRIPTION,
-    device_id: Annotated[
-        list[str] | None, typer.Option(help="Device of the calibration; repeat.")
-    ] = None,
+    device_id: options.DeviceIds = None,
     output: options.KeptFile = None,
     dry_run: options.DryRun = False,
     keep_odd: KeepOdd = False,

@@ -55,11 +55,8 @@ def doctor(
     ] = 10.0,
     description: Annotated[
         str | None,
-        typer.Option(
-            "--description",
-            "-d",
-            help="Sensor description: a shipped name or a TOML file. [the daemon's, the "
-            "recording's; of other files the pattern alone]",
+        options.description_option(
+            " [the daemon's, the recording's; of other files the pattern alone]"
         ),
     ] = None,
     frames: Annotated[
