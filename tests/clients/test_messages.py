@@ -12,10 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from tactomo_client.errors import MessageError
+from tactomo_client.filled import ARRAY_DTYPES, MAX_ARRAY_VALUES
 from tactomo_client.messages import (
-    ARRAY_DTYPES,
     KINDS,
-    MAX_ARRAY_VALUES,
     array_from_wire,
     array_to_wire,
     decode_message,

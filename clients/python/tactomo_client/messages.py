@@ -21,8 +21,6 @@ from typing import Any, Final, NamedTuple
 import msgpack  # type: ignore[import-untyped]
 
 from tactomo_client.errors import MessageError, control_error
-from tactomo_client.filled import ARRAY_DTYPES as ARRAY_DTYPES
-from tactomo_client.filled import MAX_ARRAY_VALUES as MAX_ARRAY_VALUES
 from tactomo_client.filled import array_from_wire as array_from_wire
 from tactomo_client.filled import array_to_wire as array_to_wire
 from tactomo_client.filled import filled, readers_of

@@ -9,7 +9,6 @@ from tactomo.protocols.interface import (
     PortProtocol,
     Reading,
     Trouble,
-    check_scan_fits,
 )
 from tactomo.protocols.lines import LineProtocol
 from tactomo.protocols.registry import (
@@ -29,7 +28,6 @@ __all__ = [
     "Reading",
     "Trouble",
     "available_protocols",
-    "check_scan_fits",
     "emulator_of",
     "find_protocol",
     "protocol_named",

@@ -48,17 +48,6 @@ class Trouble(NamedTuple):
     next_step: str
 
 
-def check_scan_fits(description: SensorDescription) -> None:
-    """Raise `ConfigError` for a sensor whose scan has more voltages than travel in one."""
-    if description.measurements > MAX_SAMPLES:
-        raise ConfigError(
-            f"{description.name} has {description.measurements} voltages, and a scan at most "
-            f"{MAX_SAMPLES}",
-            "list fewer drive or measuring pairs in its [pattern]; files of any number of voltages "
-            "are reconstructed by tactomo reconstruct",
-        )
-
-
 def oriented(pairs: IntArray) -> dict[tuple[int, int], tuple[int, int]]:
     """Return each pair's row and the sign 1; of a pair that is exchanged, the sign is -1."""
     rows = list(enumerate(pairs.tolist()))
@@ -114,6 +103,13 @@ class PortProtocol:
 
     def __init__(self, description: SensorDescription | None) -> None:
         """Raise ConfigError where the protocol cannot carry the sensor."""
+        if description is not None and description.measurements > MAX_SAMPLES:
+            raise ConfigError(
+                f"{description.name} has {description.measurements} voltages, and a scan at most "
+                f"{MAX_SAMPLES}",
+                "list fewer drive or measuring pairs in its [pattern]; files of any number of "
+                "voltages are reconstructed by tactomo reconstruct",
+            )
 
     @classmethod
     def recognises(cls, data: bytes) -> bool:
@@ -201,7 +197,7 @@ class ForeignProtocol(PortProtocol):
                 "carries one",
                 "give the description of a sensor with one channel, such as tank_disc",
             )
-        check_scan_fits(description)
+        super().__init__(description)
         self.description = description
         self.counts = ForeignCounts()
         self._failure: Trouble | None = None  # a mistake of the subclass, the last one

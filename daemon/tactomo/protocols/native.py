@@ -17,7 +17,7 @@ from tactomo_protocol import (
     encode,
 )
 
-from tactomo.protocols.interface import KEPT_READINGS, PortProtocol, check_scan_fits
+from tactomo.protocols.interface import KEPT_READINGS, PortProtocol
 
 if TYPE_CHECKING:
     from tactomo_models import SensorDescription
@@ -35,8 +35,7 @@ class NativeProtocol(PortProtocol):
     acknowledges = True
 
     def __init__(self, description: SensorDescription | None = None) -> None:
-        if description is not None:
-            check_scan_fits(description)
+        super().__init__(description)
         self._decoder = Decoder()
         self.counts = self._decoder.counts
         self._hello: Hello | None = None

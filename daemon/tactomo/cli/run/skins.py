@@ -15,19 +15,20 @@ import select
 import signal
 import socket
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Final
 
 import structlog
 from tactomo_models import load_description
 from tactomo_models.methods.trained_networks import SensorNetworks
 
+from tactomo.cli.children import stop_asked
 from tactomo.config import DaemonConfig
-from tactomo.ending import AS_WELL, ASKED, at_end, stop_at_end_of
+from tactomo.ending import AS_WELL, ASKED, stop_at_end_of
 from tactomo.errors import explain
 from tactomo.log import configure_logging
 from tactomo.service.daemon import Daemon, load_model
@@ -68,7 +69,6 @@ class SkinProcesses:
 
     def __init__(self, skins: Sequence[DaemonConfig]) -> None:
         self._skins = skins
-        self._is_stopping = False
         descriptions = {skin.description: load_description(skin.description) for skin in skins}
         self._artifacts = {name: load_model(each) for name, each in descriptions.items()}
         networks = [SensorNetworks(each) for each in descriptions.values()]
@@ -79,7 +79,7 @@ class SkinProcesses:
 
         0 if told to stop or every daemon has come to its end, 1 if none of them ever got ready.
         """
-        at_end(self._on_signal)
+        stop = stop_asked()
         with contextlib.ExitStack() as undo:
             folder = Path(undo.enter_context(tempfile.TemporaryDirectory(prefix="tactomo-")))
             parent_pipe, self._parent_end = os.pipe()
@@ -90,12 +90,12 @@ class SkinProcesses:
             undo.callback(_stop, processes)
             for process in processes:
                 self._start(process)
-            return self._watch(processes)
+            return self._watch(processes, stop)
 
-    def _watch(self, processes: list[_Process]) -> int:
+    def _watch(self, processes: list[_Process], stop: threading.Event) -> int:
         is_ready, told_s = False, 0.0
         sockets = {process.notify_socket: process for process in processes}
-        while not self._is_stopping:
+        while not stop.is_set():
             for notify_socket in select.select(list(sockets), [], [], TURN_S)[0]:
                 sockets[notify_socket].hear()
             for process in processes:
@@ -177,9 +177,6 @@ class SkinProcesses:
             return Daemon(skin, artifact=self._artifacts[skin.description]).run()
 
         return _Process(skin.name, run, notify_socket)
-
-    def _on_signal(self, _: int, __: FrameType | None) -> None:
-        self._is_stopping = True
 
 
 def _stop(processes: list[_Process]) -> None:
