@@ -35,15 +35,20 @@ def say(text: str = "", err: bool = False, nl: bool = True) -> None:
 
 def print_json(told: Any) -> None:
     """Print what programs read; what is not a finite number is null."""
-    typer.echo(json.dumps(_finite(told), indent=2, default=str))
+    typer.echo(json.dumps(mapped(told, _finite), indent=2, default=str))
 
 
 def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def mapped(value: Any, change: Callable[[Any], Any]) -> Any:
+    """Return maps and lists in each other with all that they hold, names included, changed."""
+    if isinstance(value, dict):
+        return {change(key): mapped(item, change) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [mapped(item, change) for item in value]
+    return change(value)
 
 
 @contextmanager

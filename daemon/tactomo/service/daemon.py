@@ -161,7 +161,11 @@ class Daemon:
         )
         self._recorder = Recorder(origin, config.recording, self._on_event)
         self._publisher = Publisher(
-            config.name, self.session, self._status_fields, self._record_message, self._on_event
+            config.name,
+            self.session,
+            lambda header: self._status.fields(header),
+            self._record_message,
+            self._on_event,
         )
         is_lossless = config.lossless or (replay is not None and replay.is_lossless)
         self._imaging = Imaging(
@@ -234,6 +238,8 @@ class Daemon:
             self._events,
             self._offered,
             self.playback,
+            self._publisher,
+            self._control,
         )
         self._access: AccessControl | None = None
         self._metrics = None if config.metrics is None else self._make_metrics()
@@ -286,12 +292,15 @@ class Daemon:
 
     def wait(self) -> int:
         """Wait until the daemon is to stop, and return the exit status that it deserves."""
-        supervision = Supervision(self._turns, self._summary)
+        supervision = Supervision(self._turns, self._status.summary)
         while not self._stop_asked.wait(WATCH_S):
             if self.config.exit_at_end and self._pipeline.finished.is_set():
                 self._why_stopped = "every replayed port is at its end"
                 break
-            if not self._all_alive():  # its traceback is in the log
+            has_access = self._access is None or self._access.is_alive
+            if not has_access or not all(
+                worker.is_alive for worker in self._workers
+            ):  # see the log
                 self._why_stopped = "a thread died"
                 log.error("thread_died", next_step="please report the traceback above")
                 return 1
@@ -310,7 +319,7 @@ class Daemon:
         # What is there now stays: never looked through again, which would take tenths of a second.
         gc.collect()
         gc.freeze()
-        notify("READY=1", f"STATUS={self._summary()}")
+        notify("READY=1", f"STATUS={self._status.summary()}")
         addresses = self.control_address, self.config.name, self.stream_address
         try:
             with announced(Running("daemon", *addresses, tuple(self.config.ports))):
@@ -324,7 +333,7 @@ class Daemon:
         """Return the fields of a `status` message as of now, envelope included."""
         envelope = self._publisher.envelope(STATUS)
         topic = {"schema": SCHEMA, "sensor": self.config.name, "kind": STATUS}
-        return {**topic, **envelope, **self._status_fields(envelope)}
+        return {**topic, **envelope, **self._status.fields(envelope)}
 
     def _on_signal(self, number: int, _: object) -> None:
         self._why_stopped = signal.Signals(number).name
@@ -332,7 +341,7 @@ class Daemon:
 
     def _last_words(self) -> dict[str, Any]:
         """What one would want to know afterwards of a daemon that is no more."""
-        status = self._status_fields(self._publisher.header)
+        status = self._status.fields(self._publisher.header)
         troubles = status["events"]["troubles"]
         said = {key: round(status[key]) for key in ("uptime_s", "frames", "dropped_scans")}
         if not troubles:
@@ -374,10 +383,6 @@ class Daemon:
 
         return MetricsServer(self.status, self._publisher.latency, lambda: self._imaging.stages)
 
-    def _all_alive(self) -> bool:
-        has_access = self._access is None or self._access.is_alive
-        return has_access and all(worker.is_alive for worker in self._workers)
-
     def _check(self) -> None:
         """Look after what has no thread of its own; called by the control thread."""
         self._recorder.check()
@@ -397,9 +402,6 @@ class Daemon:
         ports = [port for port in self._ports if not port.has_ended]
         watched = (self._pipeline, self._publisher, *ports)
         return {worker.name: worker.turns for worker in watched}
-
-    def _summary(self) -> str:
-        return self._status.summary(self._publisher.subscribers)
 
     def _set_tier(self, arguments: SetTier) -> Settling:
         method = arguments.tier
@@ -466,11 +468,6 @@ class Daemon:
     def _zero_counters(self) -> None:
         for port in self._ports:
             port.zero_counters()
-
-    def _status_fields(self, header: Mapping[str, Any]) -> Mapping[str, Any]:
-        publisher = self._publisher
-        fields = self._status.fields(publisher.latency, publisher.subscribers, header)
-        return {**fields, "control": self.control_address}
 
     def _record_message(self, kind: str, data: bytes) -> None:
         active = self._recorder.active

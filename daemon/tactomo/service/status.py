@@ -24,7 +24,9 @@ from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import REPLAY_SCHEME
 from tactomo.recordings.replay import Playback
 from tactomo.service.health_issues import health_issues
-from tactomo.timing import Durations, LastMinute
+from tactomo.stream.control import Control
+from tactomo.stream.publisher import Publisher
+from tactomo.timing import LastMinute
 
 VERSION: Final = version("tactomo")  # read from a file, which may fail later
 STALE_S: Final = 1.0
@@ -45,6 +47,8 @@ class Status:
     _events: EventBook
     _methods: Sequence[str]
     _playback: Playback | None
+    _publisher: Publisher
+    _control: Control
 
     def __post_init__(self) -> None:
         file = self._file and str(self._file)
@@ -54,15 +58,13 @@ class Status:
         self._last_minute = LastMinute()
         self._ports_last_minute = {port.url: LastMinute() for port in self._ports}
 
-    def fields(
-        self, latency: Durations, subscribers: int, header: Mapping[str, Any]
-    ) -> dict[str, Any]:
-        """Return the fields of a `status` message; the publisher's part is handed in."""
-        fields = self._fields(latency, subscribers)
+    def fields(self, header: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the fields of a `status` message with that header."""
+        fields = self._fields()
         issues = health_issues({**header, **fields})
         return {**fields, "issues": [asdict(issue) for issue in issues]}
 
-    def _fields(self, latency: Durations, subscribers: int) -> dict[str, Any]:
+    def _fields(self) -> dict[str, Any]:
         pipeline, imaging = self._pipeline, self._imaging
         active = self._recorder.active
         rest, taught = imaging.rest, imaging.calibration.taught
@@ -76,6 +78,7 @@ class Status:
             "version": VERSION,
             "state": self.state(),
             "uptime_s": time.monotonic() - self._started_s,
+            "control": self._control.address,
             "description": {
                 **self._description,
                 **pressure_fields(self._sensor, imaging.calibration.in_force),
@@ -100,7 +103,7 @@ class Status:
             "baseline": imaging.baseline,
             "companions": imaging.companions,
             "stage_ms": {stage: times for stage, times in stages.items() if times},
-            "latency_ms": latency.percentiles_ms(),
+            "latency_ms": self._publisher.latency.percentiles_ms(),
             "methods": list(self._methods),
             "tier_requested": imaging.method.requested.method,
             "budget_ms": imaging.method.requested.budget_ms,
@@ -112,7 +115,7 @@ class Status:
                 "queued_bytes": active.queued_bytes,
             },
             "recorder": self._recorder_fields(),
-            "subscribers": subscribers,
+            "subscribers": self._publisher.subscribers,
             "events": self._events.fields(),
             "process": self._process(),
         }
@@ -137,14 +140,14 @@ class Status:
             return "taring"
         return "late" if now_ns - last_ns > stale_s * 1e9 else "running"
 
-    def summary(self, subscriptions: int) -> str:
+    def summary(self) -> str:
         """Return how the daemon is in one line, for `systemctl status`."""
         state = self.state().replace("_", " ")
         absent = [port.url for port in self._ports if not port.is_open and not port.has_ended]
         if absent:
             return f"{state}, {' and '.join(absent)} not open"
         rate_hz = self._imaging.frame_rate.per_second()
-        return f"{state}: {rate_hz:.0f} frames/s, {subscriptions} subscriptions"
+        return f"{state}: {rate_hz:.0f} frames/s, {self._publisher.subscribers} subscriptions"
 
     def _port(self, port: PortReader) -> dict[str, Any]:
         fields = port_fields(port)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli import options
-from tactomo.cli.output import print_json, say
+from tactomo.cli.output import mapped, print_json, say
 from tactomo.cli.sensors import find_commanded, find_twin, newest_status, of_this_version, reader_of
 from tactomo.errors import TactomoError
 from tactomo.plain import counted, plain
@@ -309,22 +309,13 @@ def lines_of(answer: Mapping[str, Any]) -> list[str]:
 
     lines = []
     with of_this_version():
-        status = to_status(_plain(answer))
+        status = to_status(mapped(answer, lambda v: plain(v) if isinstance(v, str) else v))
         for issue in status.issues:
             colour = "red" if issue.severity == "error" else "yellow"
             lines += [typer.style(issue.what, fg=colour, bold=True), f"    {issue.next_step}"]
         lines.append(f"{status.sensor}: {_words(status.state)}")
         rows = _rows(status)
     return lines + [f"{typer.style(f'{name:<13} ', bold=True)}{value}" for name, value in rows]
-
-
-def _plain(told: Any) -> Any:
-    """Return what was told with no text in it that a terminal would obey."""
-    if isinstance(told, dict):
-        return {plain(key): _plain(value) for key, value in told.items()}
-    if isinstance(told, list | tuple):
-        return [_plain(value) for value in told]
-    return plain(told) if isinstance(told, str) else told
 
 
 def _rows(status: Status) -> list[tuple[str, str]]:
