@@ -13,8 +13,7 @@ import resource
 import socket as posix_socket
 import stat
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
@@ -206,8 +205,11 @@ def _bind(socket: zmq.Socket[bytes], endpoint: str) -> None:
         socket.bind(endpoint)
         return
     _check_file(endpoint, Path(endpoint.removeprefix(IPC)))
-    with _files_for_owner_and_group():
+    before = os.umask(0o117)  # of the file; the process's, for the moment of one system call
+    try:
         socket.bind(endpoint)
+    finally:
+        os.umask(before)
 
 
 def _check_file(endpoint: str, path: Path) -> None:
@@ -218,15 +220,6 @@ def _check_file(endpoint: str, path: Path) -> None:
         )
     if _is_served(path):
         raise zmq.ZMQError(zmq.EADDRINUSE)
-
-
-@contextmanager
-def _files_for_owner_and_group() -> Iterator[None]:
-    before = os.umask(0o117)  # the process's: for the moment of one system call
-    try:
-        yield
-    finally:
-        os.umask(before)
 
 
 def _is_served(path: Path) -> bool:

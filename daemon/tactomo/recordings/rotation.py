@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 import stat
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -48,11 +47,8 @@ def is_numbered(path: Path) -> bool:
 
 def list_recordings(folder: Path, sensor: str) -> list[KeptRecording]:
     """Return a sensor's recordings, the oldest first; raise OSError as folders do."""
-    return sorted(_recordings(folder, sensor)) if folder.is_dir() else []
-
-
-def _recordings(folder: Path, sensor: str) -> Iterator[KeptRecording]:
-    for path in folder.iterdir():
+    found = []
+    for path in folder.iterdir() if folder.is_dir() else ():
         name = re.fullmatch(ROTATED_NAME, path.name, re.ASCII)
         if name is None or name["sensor"] != sensor:
             continue
@@ -63,7 +59,8 @@ def _recordings(folder: Path, sensor: str) -> Iterator[KeptRecording]:
             continue
         if stat.S_ISREG(facts.st_mode):
             begin_s = begin.timestamp()
-            yield KeptRecording(int(name["number"]), path, facts.st_size, begin_s, begin_s)
+            found.append(KeptRecording(int(name["number"]), path, facts.st_size, begin_s, begin_s))
+    return sorted(found)
 
 
 def to_delete(
