@@ -444,12 +444,8 @@ def seen_of(frames: Sequence[tuple[float, Frame]]) -> load_cell.Seen:
     single = [frame.contacts[0] if len(frame.contacts) == 1 else None for _, frame in trusted]
     return load_cell.Seen(
         times_s=np.array([time_s for time_s, _ in trusted]),
-        magnitude=np.array([_number(c.magnitude if c else None) for c in single]),
-        magnitude_sigma=np.array([_number(c.magnitude_sigma if c else None) for c in single]),
-        contact_mm2=np.array([_number(c.area_mm2 if c else None) for c in single]),
+        magnitude=np.array([c and c.magnitude for c in single], float),  # None becomes NaN
+        magnitude_sigma=np.array([c and c.magnitude_sigma for c in single], float),
+        contact_mm2=np.array([c and c.area_mm2 for c in single], float),
         contacts=np.array([len(frame.contacts) for _, frame in trusted]),
     )
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value

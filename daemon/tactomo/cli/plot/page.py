@@ -281,8 +281,7 @@ def _draw_quantity(
         times = [t for t, _ in known]
         values = [None if _is_bound(c, name) else getattr(c, name) for _, c in known]
         bounds = [(t, getattr(c, name)) for t, c in known if _is_bound(c, name)]
-        sigmas = [getattr(c, sigma_name) for _, c in known]
-        spread = [math.nan if sigma is None else SIGMAS * sigma for sigma in sigmas]
+        spread = SIGMAS * np.array([getattr(c, sigma_name) for _, c in known], float)
         xs, ys = _broken(times, values)
         _, bands = _broken(times, spread)
         style = {"color": colours[identity]}
@@ -301,7 +300,7 @@ def _is_bound(contact: Contact, name: str) -> bool:
 def _broken(times: Sequence[float], values: Iterable[Any]) -> tuple[Any, Any]:
     """Return the two as arrays, with a gap wherever nothing came for a while."""
     xs = np.asarray(times, dtype=float)
-    ys = np.asarray([math.nan if value is None else value for value in values], dtype=float)
+    ys = np.asarray(list(values), dtype=float)  # None becomes NaN
     gaps = np.flatnonzero(np.diff(xs) > GAP_S) + 1
     return np.insert(xs, gaps, np.nan), np.insert(ys, gaps, np.nan)
 
