@@ -69,6 +69,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Import nothing of the laboratory's for a run without its tests: that takes seconds."""
+    return (collection_path.name == "lab" and "not lab" in config.option.markexpr) or None
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """With --seconds, shuffle modules: where time is short, each has its turn sooner or later."""
     if config.getoption("seconds") is not None:

@@ -114,21 +114,13 @@ def test_nothing_heavy_is_imported_to_answer(words: list[str], needed: set[str])
         (["method", "le"], {"levelset"}),
     ],
 )
-def test_the_shell_completes(words: list[str], offered: set[str]) -> None:
-    line = " ".join(["tactomo", *words])
-    result = subprocess.run(
-        [sys.executable, "-m", "tactomo.cli"],
-        env={
-            **os.environ,
-            "_TACTOMO_COMPLETE": "complete_bash",
-            "COMP_WORDS": line,
-            "COMP_CWORD": str(len(words)),
-        },
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert offered == set(result.stdout.split()), result.stderr
+def test_the_shell_completes(
+    tactomo: Run, monkeypatch: pytest.MonkeyPatch, words: list[str], offered: set[str]
+) -> None:
+    monkeypatch.setenv("_TACTOMO_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", " ".join(["tactomo", *words]))
+    monkeypatch.setenv("COMP_CWORD", str(len(words)))
+    assert offered == set(tactomo(status=0).stdout.split())
 
 
 def test_what_is_completed_is_what_there_is() -> None:
@@ -250,8 +242,15 @@ def test_a_path_or_address_that_cannot_be_is_told(tactomo: Run, words: list[str]
     assert re.search("name too long|it is no text", result.stderr), result.stderr[-300:]
 
 
-@pytest.mark.parametrize("unbuffered", ["", "1"])
-@pytest.mark.parametrize("options", [["--json"], []])
+@pytest.mark.parametrize(
+    ("options", "unbuffered"),
+    [
+        (["--json"], ""),
+        ([], "1"),
+        pytest.param(["--json"], "1", marks=pytest.mark.slow),
+        pytest.param([], "", marks=pytest.mark.slow),
+    ],
+)
 def test_what_cannot_be_written_to_is_told(options: list[str], unbuffered: str) -> None:
     """A disk that the output was directed to is full."""
     program = [sys.executable, "-m", "tactomo.cli", "info", GOLDEN, *options]

@@ -85,9 +85,9 @@ def test_big_endian_and_strided_arrays_keep_their_values() -> None:
 
 
 @given(
-    shape=values | st.lists(st.integers(-1, 2**63), max_size=6),
-    dtype=values | st.sampled_from([*ARRAY_DTYPES, ">f4", "O", "|V8", "f4,f4", "<M8[s]"]),
-    data=values | st.binary(max_size=64),
+    shape=scalars | st.lists(scalars | st.integers(-1, 2**63), max_size=6),
+    dtype=scalars | st.sampled_from([*ARRAY_DTYPES, ">f4", "O", "|V8", "f4,f4", "<M8[s]"]),
+    data=scalars | st.binary(max_size=64),
 )
 def test_no_array_map_breaks_the_decoder(shape: object, dtype: object, data: object) -> None:
     try:

@@ -23,7 +23,9 @@ from hostile_files import CORPUS
 )
 def test_hostile_files(tmp_path: Path, figure: Callable[[str], None], scale: float) -> None:
     tried = CASES[:: max(1, round(1 / scale))]
-    write_good(tmp_path)
+    good = tmp_path / "good"
+    good.mkdir()
+    write_good(good)
     places: dict[str, Path] = {}
     for number, name in enumerate(dict.fromkeys(name for name, _ in tried)):
         places[name] = tmp_path / f"of {number}" / name
@@ -34,7 +36,7 @@ def test_hostile_files(tmp_path: Path, figure: Callable[[str], None], scale: flo
         name, command = tried[number]
         folder = tmp_path / str(number)
         folder.mkdir()
-        return read_by(command, places[name], tmp_path, folder)
+        return read_by(command, places[name], good, folder)
 
     with ThreadPoolExecutor(os.cpu_count()) as readers:
         ended = list(readers.map(read, range(len(tried))))

@@ -142,12 +142,15 @@ CASES: Final = [
 def read_by(command: str, path: Path, good: Path, folder: Path) -> Ended:
     """Let a command read a hostile file; AssertionError where it takes or does too much.
 
-    `good` is the folder of `write_good`; `folder` is nobody else's.
+    `good` is a folder, which `write_good` fills for the first command that reads one of its files;
+    `folder` is nobody else's.
     """
     out = folder / "out"
     out.mkdir(exist_ok=True)
     before = held(path.parent)
     line = COMMANDS[KINDS.get(path.suffix, "arrays")][command]
+    if any(word.startswith("GOOD") for word in line) and not any(good.iterdir()):
+        write_good(good)
     places = {"FILE": str(path), **{f"GOOD{end}": str(good / f"good{end}") for end in ENDS}}
     ended = rationed(
         folder,

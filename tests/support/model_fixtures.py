@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +24,48 @@ from tactomo_models import (
 from tactomo_models.physics.bare_sheet import solve_bare_sheet
 from tactomo_models.physics.compiled_sheet import CompiledSheet
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.physics.mesh import mesh_sheet
+from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
 from tactomo_models.scene.areas import AreaFinder, Areas
 
 Tared = Callable[..., Reconstructor]
+ONCE = {
+    "tactomo_models.simulation.simulator.mesh_sheet": mesh_sheet,
+    "tactomo_models.simulation.simulator.solve_bare_sheet": solve_bare_sheet,
+    "tactomo_models.methods.method.load_or_build_artifact": load_or_build_artifact,
+}
+"""What takes a good part of a second, by where it is called from, and gives equal for equal."""
+
+
+def remembering(function: Callable[..., Any], most: int = 5) -> Callable[..., Any]:
+    """The same function, which gives what it gave the last time that it was given the same."""
+    made: dict[object, tuple[object, Any]] = {}
+
+    def told(value: object) -> object:
+        if isinstance(value, SensorDescription):
+            return value.model_dump_json()
+        if isinstance(value, np.ndarray):
+            return value.tobytes()
+        return id(value) if isinstance(value, SheetMesh) else value
+
+    @wraps(function)
+    def once(*given: Any, **options: Any) -> Any:
+        key = (os.environ.get("XDG_CACHE_HOME"), *map(told, (*given, *options.items())))
+        if key not in made:
+            made[key] = given, function(*given, **options)  # a mesh is itself while it lives
+            if len(made) > most:
+                del made[next(iter(made))]
+        return made[key][1]
+
+    return once
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _solved_once() -> Iterator[None]:
+    """A worker's simulators of equal sheets share the sheet, and its reconstructors the model."""
+    with pytest.MonkeyPatch.context() as patch:
+        for place, function in ONCE.items():
+            patch.setattr(place, remembering(function))
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -62,16 +62,16 @@ def wait_until(
     condition: Callable[[], _T],
     what: str = "what a test waits for",
     patience_s: float = PATIENCE_S,
-    step_s: float = 0.005,
+    step_s: float | None = None,
     meanwhile: Callable[[], object] = lambda: None,
 ) -> _T:
-    """Return the first true value of a condition, asked again every `step_s` seconds.
+    """Return the first true value of a condition, asked again and again.
 
     Args:
         condition: gives a true value once it holds.
         what: named if it never holds.
         patience_s: how long, seconds.
-        step_s: seconds between two times.
+        step_s: seconds between two times; None: few at first, more the longer it takes.
         meanwhile: called before each time that the condition is asked.
 
     Raises:
@@ -79,9 +79,12 @@ def wait_until(
 
     """
     deadline_s = time.monotonic() + patience_s
+    pause_s = 0.002 if step_s is None else step_s
     while True:
         meanwhile()
         if value := condition():
             return value
         assert time.monotonic() < deadline_s, f"waited {patience_s:g} s in vain for {what}"
-        time.sleep(step_s)
+        time.sleep(pause_s)
+        if step_s is None:
+            pause_s = min(1.2 * pause_s, 0.02)

@@ -1,6 +1,6 @@
 """The page in a real browser: what it draws, what a press becomes, what it says when things stop.
 
-The skin is a thread that publishes twenty frames a second on a real socket, the twin a control
+The skin is a thread that publishes ten frames a second on a real socket, the twin a control
 socket that notes what it is asked; between them and the browser is the viewer, in a thread.
 """
 
@@ -71,7 +71,7 @@ class Skin:
         }
         self.events: list[dict[str, Any]] = []
         self.sends_frames = True
-        self.period_s = 0.05
+        self.period_s = 0.1
         self._stop = threading.Event()
         self._sensor = FakeSensor("left", address)
         self.address = self._sensor.address
@@ -96,10 +96,11 @@ class Skin:
         self._sensor.close()
 
     def _run(self) -> None:
-        tick = 0
+        tick, told = 0, dict[str, Any]()
         while not self._stop.wait(self.period_s):
-            if tick % 5 == 0:
-                self._sensor.publish_message("status", self.status)
+            if tick % 3 == 0 or told != self.status:
+                told = dict(self.status)
+                self._sensor.publish_message("status", told)
             while self.events:
                 self._sensor.publish_message("event", self.events.pop(0))
             if self.sends_frames:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import functools
 import json
-import os
 import re
 import signal
 import socket
@@ -369,37 +368,21 @@ tactomo_viewer.Viewer("left", **json.loads(sys.argv[1])).serve(0)
 """
 
 
-def viewer_process(stderr: int | None = None, **addresses: str) -> subprocess.Popen[str]:
-    """Start the viewer of `left` in a process; its first line on stdout has its URL."""
-    arguments = json.dumps(addresses)
-    return subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, arguments],
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_it_prints_its_address_and_stops_when_told_though_pages_are_open(
+    sensor: FakeSensor, number: signal.Signals
+) -> None:
+    viewer = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, json.dumps({"stream": sensor.address})],
         stdout=subprocess.PIPE,
-        stderr=stderr,
+        stderr=subprocess.PIPE,
         text=True,
     )
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_it_prints_its_address_and_stops_when_told(number: signal.Signals) -> None:
-    viewer = viewer_process(stream=NOBODY, stderr=subprocess.PIPE)
     assert viewer.stdout is not None
     try:
         line = viewer.stdout.readline()
         assert re.fullmatch(r"viewer: http://127\.0\.0\.1:[1-9]\d*/\n", line)
-        os.kill(viewer.pid, number)
-        output, errors = viewer.communicate(timeout=60)
-        assert (viewer.returncode, output, errors) == (0, "", "")
-    finally:
-        viewer.kill()
-        viewer.communicate()
-
-
-def test_open_pages_do_not_hold_up_the_end(sensor: FakeSensor) -> None:
-    viewer = viewer_process(stream=sensor.address)
-    assert viewer.stdout is not None
-    try:
-        url = viewer.stdout.readline().split()[-1]
+        url = line.split()[-1]
 
         async def stop_under_a_page() -> None:
             async with (
@@ -407,13 +390,14 @@ def test_open_pages_do_not_hold_up_the_end(sensor: FakeSensor) -> None:
                 session.ws_connect(url + "socket", origin=url.rstrip("/")) as websocket,
             ):
                 await websocket.receive()
-                viewer.terminate()
+                viewer.send_signal(number)
                 while not websocket.closed:
                     await websocket.receive(timeout=60)
                 assert websocket.close_code == aiohttp.WSCloseCode.GOING_AWAY
 
         asyncio.run(stop_under_a_page())
-        assert viewer.wait(60) == 0
+        output, errors = viewer.communicate(timeout=60)
+        assert (viewer.returncode, output, errors) == (0, "", "")
     finally:
         viewer.kill()
         viewer.communicate()

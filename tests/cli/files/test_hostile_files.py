@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 import pytest
-from hostile_commands import CASES, rationed, read_by, write_good
+from hostile_commands import CASES, rationed, read_by
 from hostile_files import CORPUS
 from tactomo_models import SkinSimulator, load_description
 
@@ -27,10 +27,8 @@ QUICK: Final = {
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of files with which nothing is the matter."""
-    folder = tmp_path_factory.mktemp("good")
-    write_good(folder)
-    return folder
+    """The folder for files with which nothing is the matter."""
+    return tmp_path_factory.mktemp("good")
 
 
 @pytest.fixture(scope="module")

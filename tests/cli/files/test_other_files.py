@@ -72,7 +72,10 @@ def test_matlab_arrays(tactomo: Run, tmp_path: Path) -> None:
     savemat(tmp_path / "d.mat", {"structure": there, "structure_reference": rest[:1], "t": times})
     located(tactomo, tmp_path, tmp_path / "a.mat")
     located(tactomo, tmp_path, tmp_path / "c.mat", "--reference", tmp_path / "b.mat")
-    located(tactomo, tmp_path, tmp_path / "d.mat")
+    scans = read_scans(tmp_path / "d.mat", load_description("tank_disc"), None)
+    np.testing.assert_array_equal(*scans.volts.values(), there)
+    np.testing.assert_array_equal(np.ravel(*scans.reference.values()), rest[0])
+    np.testing.assert_array_equal(scans.times(None), times.ravel())
 
 
 def save_hdf5(path: Path, arrays: dict[str, Any]) -> None:

@@ -173,7 +173,9 @@ def test_bad_scans_are_flagged_in_the_file(tactomo: Run, tmp_path: Path) -> None
     assert flags[5] & (Flag.NOISE_HIGH | Flag.STRUCTURE_MISSING)
 
 
-@pytest.mark.parametrize("methods", [("tikhonov,noser",), ("tikhonov", "noser")])
+@pytest.mark.parametrize(
+    "methods", [("tikhonov,noser",), pytest.param(("tikhonov", "noser"), marks=pytest.mark.slow)]
+)
 def test_methods_are_drawn_side_by_side(
     tactomo: Run, tmp_path: Path, methods: tuple[str, ...]
 ) -> None:

@@ -33,10 +33,19 @@ def axes_labels(figure: Any) -> list[str]:
     return [axes.get_ylabel() for axes in figure.axes]
 
 
-@pytest.mark.parametrize("name", ["page.png", "page.svg", "page.pdf"])
-def test_a_page_of_each_kind(tactomo: Run, grasp: Path, name: str) -> None:
-    result = tactomo("plot", grasp, "-o", name, status=0)
-    assert result.stdout == f"wrote {name}: 2 contacts in 78 frames, 4.0 s\n"
+@pytest.mark.parametrize(
+    ("name", "times", "shows"),
+    [
+        ("page.png", (), "2 contacts in 78 frames, 4.0 s"),
+        ("page.svg", ("--from", 1, "--to", 2), "1 contact in 20 frames, 1.0 s"),
+        pytest.param("page.pdf", (), "2 contacts in 78 frames, 4.0 s", marks=pytest.mark.slow),
+    ],
+)
+def test_a_page_of_each_kind_and_of_some_seconds(
+    tactomo: Run, grasp: Path, name: str, times: tuple[object, ...], shows: str
+) -> None:
+    result = tactomo("plot", grasp, "-o", name, *times, status=0)
+    assert result.stdout == f"wrote {name}: {shows}\n"
     data = grasp.with_name(name).read_bytes()
     assert data.startswith({"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF"}[name[-3:]])
     if name.endswith("png"):
@@ -90,11 +99,6 @@ def test_a_lower_bound_is_on_no_line(tmp_path: Path, what: str) -> None:
     (at_s,) = marks.get_xdata()
     lines = [line for line in axes.lines if line.get_linestyle() == "-"]
     assert not [y for line in lines for x, y in line.get_xydata() if x == at_s and y == y]
-
-
-def test_some_seconds(tactomo: Run, grasp: Path) -> None:
-    result = tactomo("plot", grasp, "-o", "some.png", "--from", 1, "--to", 2, status=0)
-    assert "1 contact in 20 frames" in result.stdout
 
 
 @pytest.mark.parametrize(

@@ -113,7 +113,9 @@ def test_a_child_that_fails_takes_the_demo_down_and_its_words_are_shown(tactomo:
     assert "cannot read the sensor description nosuch" in result.stderr
 
 
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGQUIT])
+@pytest.mark.parametrize(
+    "number", [signal.SIGHUP, pytest.param(signal.SIGQUIT, marks=pytest.mark.slow)]
+)
 def test_a_viewer_ends_in_order_with_its_terminal(start: Run, number: signal.Signals) -> None:
     nobody = "tcp://127.0.0.1:1"
     where = ("--sensor", "left", "--address", nobody, "--control", nobody)

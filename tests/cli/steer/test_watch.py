@@ -57,18 +57,12 @@ def sensor() -> Iterator[FakeSensor]:
             yield fake
 
 
-def in_a_terminal(*arguments: str, until: str) -> tuple[str, int]:
-    """Run watch in a terminal until it shows something, then press Ctrl-C."""
-    with Terminal("watch", *arguments) as terminal:
-        terminal.wait_for(until)
-        terminal.press_ctrl_c()
-        status = terminal.wait()
-        return terminal.shown, status
-
-
 def test_it_shows_map_contacts_and_health_and_ends_by_ctrl_c(sensor: FakeSensor) -> None:
-    shown, status = in_a_terminal("--address", sensor.address, until="19.7 frames/s")
-    assert status == 0
+    with Terminal("watch", "--address", sensor.address) as terminal:
+        terminal.wait_for("19.7 frames/s")
+        terminal.press_ctrl_c()
+        assert terminal.wait() == 0
+    shown = terminal.shown
     assert "▀" * 51 in shown
     assert "171 kPa" in shown
     assert "running" in shown
@@ -76,18 +70,16 @@ def test_it_shows_map_contacts_and_health_and_ends_by_ctrl_c(sensor: FakeSensor)
 
 
 def test_it_says_when_data_are_stale_and_the_end_of_a_replay_is_not_called_so() -> None:
-    with FakeSensor("left") as fake, old_frames(fake):
-        shown, _ = in_a_terminal(until="STALE")
-    assert "STALE: the newest frame is" in shown
-    assert "nothing pressed" not in shown
-    with FakeSensor("left") as fake, old_frames(fake, {**STATUS, "state": "ended"}):
-        shown, _ = in_a_terminal(until="19.7 frames/s")
-    assert "STALE" not in shown
-    assert "ended" in shown
+    status = dict(STATUS)
+    with FakeSensor("left") as fake, old_frames(fake, status), Terminal("watch") as terminal:
+        assert "nothing pressed" not in terminal.wait_for("STALE: the newest frame is")
+        status["state"] = "ended"
+        terminal.wait_for("ended")
+        assert "STALE" not in terminal.wait_for("ended") + terminal.wait_for("ended")
 
 
 @contextmanager
-def old_frames(fake: FakeSensor, status: dict[str, Any] = STATUS) -> Iterator[None]:
+def old_frames(fake: FakeSensor, status: dict[str, Any]) -> Iterator[None]:
     """Publish, over and over, a status and then a frame of long ago."""
     old: dict[str, Any] = {"acquired_monotonic_ns": time.monotonic_ns() - 2_000_000_000}
     missing = ["map", "status", "event"]  # or the frame might come without its status

@@ -138,7 +138,14 @@ def test_a_light_press_is_no_rest_by_the_reference_before_the_tare(
     assert b.step(0.0)["flags"] == []
 
 
-@pytest.mark.parametrize("found", [SkinAtStart.KNOWN, SkinAtStart.LOADED, SkinAtStart.OTHER])
+@pytest.mark.parametrize(
+    "found",
+    [
+        SkinAtStart.KNOWN,
+        SkinAtStart.LOADED,
+        pytest.param(SkinAtStart.OTHER, marks=pytest.mark.slow),
+    ],
+)
 def test_a_second_tare_with_nothing_shown_settles_it_unless_contacts_explain_it(
     bench: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, found: SkinAtStart
 ) -> None:

@@ -57,7 +57,7 @@ def test_rates_are_what_comes_and_nothing_when_nothing_comes(bench: Start) -> No
     b.listener.wait("status", lambda s: s["rates"]["frames_hz"] == 0)
 
 
-@pytest.mark.parametrize("sockets", [200, 1])
+@pytest.mark.parametrize("sockets", [pytest.param(200, marks=pytest.mark.slow), 1])
 def test_two_hundred_tares_at_once_are_all_answered(
     bench: Start, connect: Start, sockets: int
 ) -> None:

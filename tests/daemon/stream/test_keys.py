@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 import zmq
-from fixture_types import Start
+from fixture_types import Run, Start
 from page import Page
 from tactomo.config import load_config
 from tactomo.endpoint import bind
@@ -140,17 +140,17 @@ def test_a_stranger_is_turned_away_in_an_event_loop_until_allowed(
     asyncio.run(look())
 
 
-def test_another_process_gets_in_with_the_folder_alone(guarded: Any, robot: Robot) -> None:
-    command = [sys.executable, "-m", "tactomo.cli", "status", "--json"]
-    command += ["--address", guarded.daemon.stream_address]
+def test_another_process_gets_in_with_the_folder_alone(
+    guarded: Any, robot: Robot, tactomo: Run
+) -> None:
+    words = ["status", "--json", "--address", guarded.daemon.stream_address]
+    command = [sys.executable, "-m", "tactomo.cli", *words]
     desk = robot.folder.parent / "clients" / "desk"
     environment = {**os.environ, "TACTOMO_KEYS": str(desk)}
     said = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     assert said.returncode == 0, said.stderr
     assert '"state"' in said.stdout
-    environment.pop("TACTOMO_KEYS")
-    said = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
-    assert said.returncode == 1
+    said = tactomo(*words, status=1)
     assert "hangs up on a client without keys" in said.stderr
     assert "TACTOMO_KEYS" in said.stderr
 

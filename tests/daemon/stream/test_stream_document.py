@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -60,11 +61,16 @@ def test_every_state_is_listed_and_scraped() -> None:
     assert tuple(told) == metrics.STATES
 
 
+@cache
+def sources() -> dict[Path, ast.Module]:
+    """The daemon's modules."""
+    paths = Path(tactomo.__path__[0]).rglob("*.py")
+    return {path: ast.parse(path.read_text("utf-8")) for path in paths}
+
+
 def test_every_event_is_listed_and_told() -> None:
     assert {kind.end for kind in EVENTS.values() if kind.end} <= EVENTS.keys()
-    sources = Path(tactomo.__path__[0]).rglob("*.py")
-    trees = [ast.parse(path.read_text("utf-8")) for path in sources]
-    told = {name for tree in trees for name in events_told(tree)}
+    told = {name for tree in sources().values() for name in events_told(tree)}
     assert told | {name for name, _ in TROUBLES.values()} == EVENTS.keys()
 
 
@@ -79,9 +85,8 @@ def events_told(source: ast.AST) -> Iterator[str]:
 
 
 def test_every_error_of_a_command_is_listed() -> None:
-    folder = Path(tactomo.__path__[0])
-    sources = [path for path in folder.rglob("*.py") if "cli" not in path.parts]
-    raised = {name for path in sources for name in refusals(ast.parse(path.read_text("utf-8")))}
+    served = [tree for path, tree in sources().items() if "cli" not in path.parts]
+    raised = {name for tree in served for name in refusals(tree)}
     listed = cells_of("clients/STREAM.md", "### Errors")
     assert listed.keys() == raised | {"malformed_message"}
     commands = {*tactomo.stream.control.COMMANDS, *tactomo.twin.control.COMMANDS}

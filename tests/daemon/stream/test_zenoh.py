@@ -126,15 +126,17 @@ class Samples:
         wait_until(condition, meanwhile=send, step_s=0.02)
 
 
-def test_each_kind_has_its_key_and_its_count(
+def test_each_kind_has_its_key_and_its_count_and_a_query_gets_the_newest(
     left: FakeSensor, right: FakeSensor, start: Start, desk: zenoh.Session
 ) -> None:
     samples = Samples(desk, "tactomo/**")
     start(left, right, robot="arm")
     wanted = {f"tactomo/arm/{s}/{k}" for s in ("left", "right") for k in ("map", "contacts")}
+    wanted.add("tactomo/arm/left/status")
 
     def send() -> None:
-        left.publish(map=np.ones((3, 3), np.float32))
+        left.publish(TOUCH, map=np.ones((3, 3), np.float32))
+        left.publish_message("status", {"state": "running"})
         right.publish()
 
     samples.until(lambda: {key for key, _, _ in samples.all} == wanted, send)
@@ -142,6 +144,15 @@ def test_each_kind_has_its_key_and_its_count(
         assert key == f"tactomo/arm/{fields['sensor']}/{fields['kind']}"
     counts = [n for key, _, n in samples.all if key == "tactomo/arm/left/contacts"]
     assert counts == list(range(counts[0], counts[0] + len(counts)))
+    replies = {str(r.ok.key_expr): r.ok for r in desk.get("tactomo/*/left/*") if r.ok}
+    assert replies.keys() == {"tactomo/arm/left/status", "tactomo/arm/left/contacts"}
+    status = replies["tactomo/arm/left/status"]
+    assert msgpack.unpackb(status.payload.to_bytes())["state"] == "running"
+    assert status.attachment
+    count = int(status.attachment.to_string())  # of the sample that it repeats
+    wait_until(lambda: ("tactomo/arm/left/status", count) in {(k, n) for k, _, n in samples.all})
+    contacts = msgpack.unpackb(replies["tactomo/arm/left/contacts"].payload.to_bytes())
+    assert len(contacts["contacts"]) == 1
 
 
 @pytest.mark.slow
@@ -207,28 +218,6 @@ def test_contacts_of_a_simulated_skin_at_rest_are_sent_by_a_heartbeat(
         wait_until(lambda: len(samples.all) >= seen + 10)
         came, took_s = len(samples.all) - seen, time.monotonic() - began_s
     assert came <= took_s / HEARTBEAT_S + 2
-
-
-def test_a_query_gets_the_newest_contacts_and_status(
-    left: FakeSensor, start: Start, desk: zenoh.Session
-) -> None:
-    samples = Samples(desk, "tactomo/arm/left/status")
-    start(left, robot="arm")
-
-    def send() -> None:
-        left.publish(TOUCH)
-        left.publish_message("status", {"state": "running"})
-
-    samples.until(lambda: samples.all, send)
-    replies = {str(r.ok.key_expr): r.ok for r in desk.get("tactomo/*/left/*") if r.ok}
-    assert replies.keys() == {"tactomo/arm/left/status", "tactomo/arm/left/contacts"}
-    status = replies["tactomo/arm/left/status"]
-    assert msgpack.unpackb(status.payload.to_bytes())["state"] == "running"
-    assert status.attachment
-    count = int(status.attachment.to_string())  # of the sample that it repeats
-    wait_until(lambda: count in {each for _, _, each in samples.all})
-    contacts = msgpack.unpackb(replies["tactomo/arm/left/contacts"].payload.to_bytes())
-    assert len(contacts["contacts"]) == 1
 
 
 @pytest.mark.slow
@@ -309,7 +298,7 @@ def test_late_joiners_get_the_last_status_at_once(
         wait_until(partial(is_repeated, prefix), "a status at once")
 
 
-def test_zenoh_is_asked_for_what_somebody_wants_and_no_longer(
+def test_zenoh_is_asked_for_what_somebody_wants_what_is_lost_is_told_and_no_web_page_gets_it(
     desk: zenoh.Session, start: Start, connect: Any
 ) -> None:
     publisher: Any = desk.declare_publisher("tactomo/arm/left/contacts")  # typed as not so
@@ -317,13 +306,20 @@ def test_zenoh_is_asked_for_what_somebody_wants_and_no_longer(
     def is_wanted() -> bool:
         return bool(publisher.matching_status.matching)
 
-    address = start(bind="tcp://127.0.0.1:0").address
-    wanted = [connect(zmq.SUB, address, topic("left", "contacts")) for _ in range(2)]
+    running = start(bind="tcp://127.0.0.1:0")
+    wanted = [connect(zmq.SUB, running.address, topic("left", "contacts")) for _ in range(2)]
     wait_until(is_wanted, "a subscriber")
     for one in wanted:
         assert is_wanted()
         one.close()
     wait_until(lambda: not is_wanted(), "nobody")
+    one = connect(zmq.SUB, running.address, b"left/")
+    put = partial(desk.put, "tactomo/arm/left/contacts", b"\x80")
+    wait_until(lambda: one.poll(0), meanwhile=lambda: put(attachment="1"), step_s=0.02)
+    for count in ("2", "6", "not a number"):
+        put(attachment=count)
+    assert running.said("messages_lost")["detail"].startswith("3 so far")
+    assert b"left" not in post(running.address, [SUBSCRIBE + b"left/"])
 
 
 @pytest.mark.slow
@@ -356,19 +352,6 @@ def test_a_source_that_never_answered_is_missed_once(tmp_path: Path, start: Star
     assert "start its daemon" in warning["next_step"]
     with FakeSensor("left", left.address):
         assert left.address in running.said("source_came")["detail"]
-
-
-def test_what_is_lost_is_told_and_a_web_pages_subscription_gets_nothing(
-    desk: zenoh.Session, start: Start, connect: Any
-) -> None:
-    running = start(bind="tcp://127.0.0.1:0")
-    one = connect(zmq.SUB, running.address, b"left/")
-    put = partial(desk.put, "tactomo/arm/left/contacts", b"\x80")
-    wait_until(lambda: one.poll(0), meanwhile=lambda: put(attachment="1"), step_s=0.02)
-    for count in ("2", "6", "not a number"):
-        put(attachment=count)
-    assert running.said("messages_lost")["detail"].startswith("3 so far")
-    assert b"left" not in post(running.address, [SUBSCRIBE + b"left/"])
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from tactomo_models.commissioning.teach import KnownPresses, teach
 
 def test_a_place_in_the_notch_of_an_l_is_off_the_skin() -> None:
     sensor = load_description("palm_l")
-    skin = Skin(SkinSimulator(sensor))
+    skin = Skin(SkinSimulator(sensor, 0.008))
     x_m, y_m = (each.ravel() for each in np.meshgrid(np.arange(-0.05, 0.06, 0.02), (-0.045, -0.02)))
     xy_m = np.r_[np.c_[x_m, y_m], [(-0.045, y) for y in np.arange(0.0, 0.05, 0.005)]]
     scans = [skin.scan(Press(x, y, 150.0, 0.01))["magnitude"] for x, y in xy_m]

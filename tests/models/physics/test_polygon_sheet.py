@@ -42,14 +42,14 @@ def area_of(mesh: skfem.MeshTri) -> FloatArray:
 @pytest.mark.parametrize("name", POLYGONS)
 def test_every_map_node_inside_is_a_mesh_node(name: str) -> None:
     sensor = load_description(name)
-    mesh = mesh_sheet(sensor).mesh
+    sheet = mesh_sheet(sensor)
     step_m = sensor.map_y_m[1] - sensor.map_y_m[0]
     x, y = np.meshgrid(sensor.map_x_m, sensor.map_y_m)
     deep = sensor.on_sheet(x, y, step_m / 2)
-    nodes = {(round(a, 9), round(b, 9)) for a, b in mesh.p.T}
+    nodes = {(round(a, 9), round(b, 9)) for a, b in sheet.mesh.p.T}
     wanted = {(round(a, 9), round(b, 9)) for a, b in zip(x[deep], y[deep], strict=True)}
     assert wanted <= nodes
-    bare = solve_bare_sheet(sensor, mesh_sheet(sensor), quick=True)
+    bare = solve_bare_sheet(sensor, sheet, quick=True)
     covered = np.diff(bare.map_weights.tocsr().indptr) > 0
     assert (covered[sensor.on_sheet(x, y, sensor.sheet.frame_width_m + step_m).ravel()]).all()
     assert not covered[~sensor.on_sheet(x, y, -step_m / 2).ravel()].any()
@@ -191,15 +191,15 @@ def test_voltages_converge_and_the_jacobian_passes_a_taylor_test(
     name: str, place: tuple[float, float]
 ) -> None:
     sensor = load_description(name)
-    found = []
-    for spacing_m in (0.008, 0.004, 0.002):
-        forward = model(sensor, spacing_m)
-        pressed = forward.solve(bump(forward, place)).voltages
-        found.append(np.concatenate([forward.bare_voltages, pressed]))
+    models = [model(sensor, spacing_m) for spacing_m in (0.008, 0.004, 0.002)]
+    found = [
+        np.concatenate([each.bare_voltages, each.solve(bump(each, place)).voltages])
+        for each in models
+    ]
     # An L's corner and electrodes' ends are singular: the order is what a rectangle's is, above 1.
     errors = [np.linalg.norm((v - found[2]) / found[2]) for v in found[:2]]
     assert np.log2(errors[0] / errors[1]) > 1
-    forward = model(sensor, 0.004)
+    forward = models[1]
     change = bump(forward, place)
     where = np.flatnonzero(change > 1e-2)
     change[change <= 1e-2] = 0

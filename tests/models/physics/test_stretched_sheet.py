@@ -131,6 +131,7 @@ def test_contacts_on_a_stretched_sheet_are_where_and_as_large_as_they_are(
     tares = {
         name: volts * (1 + 1e-4 * rng.normal(size=(8, volts.size))) for name, volts in bare.items()
     }
+    made = [Reconstructor(known, method="fit") for known in (sensor, small)]
     errors_m: defaultdict[str, list[float]] = defaultdict(list)
     errors_n: defaultdict[str, list[float]] = defaultdict(list)
     for x, y in ((0.0, 0.0), (0.012, -0.008), (-0.014, 0.006)):
@@ -140,12 +141,11 @@ def test_contacts_on_a_stretched_sheet_are_where_and_as_large_as_they_are(
         wide, high = (1e5 * float(np.linalg.norm(each)) for each in (across, up))
         volts = skin.voltages([Press(x, y, 180.0, 0.008 / wide, 0.008 / high)])
         scans = {name: v * (1 + 1e-4 * rng.normal(size=v.size)) for name, v in volts.items()}
-        for known in (sensor, small):
-            made = Reconstructor(known, method="fit")
-            made.set_reference(
+        for known, reconstructor in zip((sensor, small), made, strict=True):
+            reconstructor.set_reference(
                 Reference.from_scans(tares[Channel.MAGNITUDE], tares[Channel.STRUCTURE])
             )
-            frame = made.reconstruct(scans[Channel.MAGNITUDE], scans[Channel.STRUCTURE])
+            frame = reconstructor.reconstruct(scans[Channel.MAGNITUDE], scans[Channel.STRUCTURE])
             [found] = frame.contacts
             off = np.hypot(wide * (found.x_m - x), high * (found.y_m - y))
             errors_m[known.name].append(off)
