@@ -13,10 +13,7 @@ from typing import Any
 import pytest
 from fixture_types import Run
 from tactomo.cli import app, commands
-from tactomo.cli.options import (
-    METHODS,
-    description_names,
-)
+from tactomo.cli.options import METHODS, description_names
 from tactomo.config import DaemonConfig
 from tactomo_models import METHODS as METHODS_THERE
 from tactomo_models import shipped_descriptions

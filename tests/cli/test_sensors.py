@@ -39,10 +39,7 @@ def announcing(*programs: Running) -> Iterator[None]:
 def telling(sensor: str, **status: Any) -> Iterator[FakeSensor]:
     """Publish a sensor's status, over and over."""
     said = {"sensor": sensor, "state": "running", **status}
-    with (
-        FakeSensor(sensor) as fake,
-        repeated(lambda: fake.publish_message("status", said)),
-    ):
+    with FakeSensor(sensor) as fake, repeated(lambda: fake.publish_message("status", said)):
         yield fake
 
 

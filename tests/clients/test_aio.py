@@ -11,13 +11,7 @@ from typing import Any
 import pytest
 import uvloop
 from fake_control import FakeControl
-from tactomo_client import (
-    Contact,
-    Frame,
-    NoAnswer,
-    StreamTimeout,
-    aio,
-)
+from tactomo_client import Contact, Frame, NoAnswer, StreamTimeout, aio
 from tactomo_client.fake import FakeSensor
 from waiting import repeated
 

@@ -22,13 +22,7 @@ import msgpack  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 from builds import SANITIZED, runs
-from cpp_client import (
-    Watch,
-    compile_probe,
-    decode,
-    need_headers,
-    run,
-)
+from cpp_client import Watch, compile_probe, decode, need_headers, run
 from daemon_process import SENSOR, DaemonProcess
 from fake_control import FakeControl
 from fuzz_targets import CONTACT, HEADER
@@ -36,12 +30,7 @@ from tactomo.cli.children import ProcessGroup
 from tactomo.stream import keys as key_files
 from tactomo_client import ClientError, Contact, ControlError, Frame, request, subscribe
 from tactomo_client.fake import FakeSensor
-from tactomo_client.messages import (
-    CONTACTS,
-    MAP,
-    decode_message,
-    frame_from_message,
-)
+from tactomo_client.messages import CONTACTS, MAP, decode_message, frame_from_message
 from waiting import wait_until
 
 PATIENCE_S = 60.0

@@ -110,12 +110,7 @@ def replay(tmp_path: Path) -> Callable[..., Any]:
     """Replay a recording to its end: ``replay(path, speed=0, **config)`` returns what was said."""
     count = itertools.count()
 
-    def run(
-        path: Path,
-        speed: float = 0,
-        real: bool = False,
-        **config: Any,
-    ) -> Heard:
+    def run(path: Path, speed: float = 0, real: bool = False, **config: Any) -> Heard:
         out = tmp_path / f"replayed-{next(count)}.mcap"
         settings = {
             "name": "left",

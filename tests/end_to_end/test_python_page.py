@@ -19,10 +19,7 @@ PAGE = Page("docs/python.md")
 FILES = ("own_method.py", "float_board.py")
 RUN_AT_ONCE = ("Arrays in", "What a frame says", "Methods")
 METHOD, PROTOCOL = "A method of your own", "A device protocol of your own"
-SMALLER = {
-    "--count 8": "--count 1",
-    "--method tikhonov --count 2": "--count 1",
-}
+SMALLER = {"--count 8": "--count 1", "--method tikhonov --count 2": "--count 1"}
 
 
 @pytest.fixture

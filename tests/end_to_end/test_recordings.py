@@ -41,13 +41,7 @@ def test_a_measured_stream_is_imported_replayed_and_located(tmp_path: Path) -> N
         *("import", tank, recording, "--description", "tank_disc", "--reference-frames", "0:20")
     )
     tactomo(
-        *(
-            "daemon",
-            "--description",
-            "tank_disc",
-            "--port",
-            f"replay://{recording}?port=0&speed=0",
-        ),
+        *("daemon", "--description", "tank_disc", "--port", f"replay://{recording}?port=0&speed=0"),
         *("--set", f"recording.file={again}", "--set", "recording.maps=true"),
         *("--set", "exit_at_end=true"),
         *("--stream", ANYWHERE, "--control", ANYWHERE),
@@ -96,9 +90,7 @@ def test_a_replay_with_a_page_begins_when_it_is_open_and_shows_where_it_is_moved
     command = ["replay", path, "--viewer", "--loop", "--viewer-port", 0, "--control", control]
     command += ["--stream", f"ipc://{tmp_path}/stream"]
     replay = subprocess.Popen(
-        [sys.executable, "-m", "tactomo.cli", *map(str, command)],
-        stdout=subprocess.PIPE,
-        text=True,
+        [sys.executable, "-m", "tactomo.cli", *map(str, command)], stdout=subprocess.PIPE, text=True
     )
     try:
         assert replay.stdout is not None

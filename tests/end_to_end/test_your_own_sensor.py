@@ -13,9 +13,7 @@ from pathlib import Path
 import pytest
 from newcomer import Newcomer
 from page import Page
-from tactomo_models import (
-    SensorDescription,
-)
+from tactomo_models import SensorDescription
 from tactomo_models.sensor.outline import Pad
 
 pytestmark = pytest.mark.slow

@@ -132,10 +132,7 @@ def play(skin: PtySkin) -> Iterator[Callable[..., Playing]]:
 
 @pytest.fixture
 def tared(
-    skin: PtySkin,
-    scenes: Scenes,
-    start: Callable[..., DaemonProcess],
-    play: Callable[..., Playing],
+    skin: PtySkin, scenes: Scenes, start: Callable[..., DaemonProcess], play: Callable[..., Playing]
 ) -> Callable[..., DaemonProcess]:
     """Start a daemon on the skin and see it through its first reference."""
 

@@ -228,10 +228,7 @@ def test_a_fuzzer_finds_nothing_in_a_moment(tmp_path: Path, fuzzer: str) -> None
         lacking("needs a clang with libFuzzer (Debian: libclang-rt-14-dev)")
     program = build(fuzzer)
     seeds = tmp_path / "seeds"
-    subprocess.run(
-        [sys.executable, C_FOLDER / "tests" / "make_seeds.py", seeds],
-        check=True,
-    )
+    subprocess.run([sys.executable, C_FOLDER / "tests" / "make_seeds.py", seeds], check=True)
     options = ["-seed=1", "-runs=1500", "-max_total_time=5", f"-artifact_prefix={tmp_path}/"]
     done = subprocess.run([program, *options, seeds], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-4000:]

@@ -79,16 +79,8 @@ BAD_FIELDS = [
     (replace(HELLO, firmware="1.0\x1b[31m"), "Hello.firmware", "control characters"),
     (replace(HELLO, firmware="1.0\x9b"), "Hello.firmware", "control characters"),
     (replace(HELLO, channels=()), "Hello.channels", "one or more"),
-    (
-        replace(HELLO, channels=tuple(reversed(Channel))),
-        "Hello.channels",
-        "ascending",
-    ),
-    (
-        replace(HELLO, channels=(Channel.STRUCTURE,) * 2),
-        "Hello.channels",
-        "none twice",
-    ),
+    (replace(HELLO, channels=tuple(reversed(Channel))), "Hello.channels", "ascending"),
+    (replace(HELLO, channels=(Channel.STRUCTURE,) * 2), "Hello.channels", "none twice"),
     (replace(HELLO, channels=(3,)), "Hello.channels", "one of magnitude, structure"),  # type: ignore[arg-type]
     (replace(HELLO, electrodes=256), "Hello.electrodes", "from 2 to 255"),
     (replace(HELLO, drive_offset=16), "Hello.drive_offset", "from 1 to 15"),

@@ -196,7 +196,7 @@ def test_the_noise_is_that_of_the_scans_however_good_the_reference(
     scans = [skin.scan(*presses) for presses in [(), (), PRESSES[1], PRESSES[2], (), ()]]
     out = run(
         {name: np.array([scan[name] for scan in scans]) for name in scans[0]}
-        | {"magnitude_reference": rest.magnitude, "structure_reference": rest.structure},
+        | {"magnitude_reference": rest.magnitude, "structure_reference": rest.structure}
     )
     assert np.bincount(out["contact_frame"], minlength=6).tolist() == [0, 0, 1, 2, 0, 0]
     assert not out["flags"].any()

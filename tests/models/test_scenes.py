@@ -42,12 +42,7 @@ FLOORS = {
 # it is worth still. A way to get it back to the scene's own floor empties this table. (Of "moving"
 # 0.966 was kept until the odds of kinds, 1.4 nats too low where other contacts and the structure
 # sheet's ratio answered to first order alone, came from solves of all contacts together.)
-LOST = {
-    "ordinary": 0.974,
-    "by hand, ring and disc": 0.974,
-    "side by side": 0.966,
-    "moving": 0.958,
-}
+LOST = {"ordinary": 0.974, "by hand, ring and disc": 0.974, "side by side": 0.966, "moving": 0.958}
 
 
 @pytest.fixture(scope="module")

@@ -70,11 +70,9 @@ def hellos(draw: st.DrawFn) -> Hello:
     )
 
 
-COMMANDS = st.builds(
-    Command,
-    U8.filter(lambda code: code != CommandCode.SET_RATE),
-    U8,
-) | st.builds(Command, st.just(CommandCode.SET_RATE), U8, POSITIVE)
+COMMANDS = st.builds(Command, U8.filter(lambda code: code != CommandCode.SET_RATE), U8) | st.builds(
+    Command, st.just(CommandCode.SET_RATE), U8, POSITIVE
+)
 ACKNOWLEDGES = st.builds(Acknowledge, U8, U8, st.sampled_from(AckStatus))
 COMPANIONS = st.builds(
     CompanionReading,
@@ -84,9 +82,7 @@ COMPANIONS = st.builds(
     st.floats(width=32, allow_nan=False, allow_infinity=False),
 )
 UNKNOWNS = st.builds(
-    UnknownPacket,
-    U8.filter(lambda kind: kind not in (1, 2, 3, 4, 0x81)),
-    st.binary(max_size=300),
+    UnknownPacket, U8.filter(lambda kind: kind not in (1, 2, 3, 4, 0x81)), st.binary(max_size=300)
 )
 PACKETS: st.SearchStrategy[Packet] = st.one_of(
     scans(), hellos(), COMMANDS, ACKNOWLEDGES, COMPANIONS, UNKNOWNS

@@ -174,11 +174,7 @@ class Listener:
     """Subscribes to all kinds of one sensor's messages and keeps them."""
 
     def __init__(
-        self,
-        address: str,
-        sensor: str,
-        kinds: tuple[str, ...] = KINDS,
-        keys: Keys | None = None,
+        self, address: str, sensor: str, kinds: tuple[str, ...] = KINDS, keys: Keys | None = None
     ) -> None:
         self.messages: list[Message] = []
         self.socket = listening(address, *(topic(sensor, kind) for kind in kinds), keys=keys)

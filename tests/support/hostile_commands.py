@@ -58,10 +58,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
         "reconstruct": ("reconstruct", "GOOD.npz", "OUT.npz", "-d", "FILE"),
         "config": ("daemon", "FILE"),
     },
-    "drawing": {
-        "info": ("info", "FILE"),
-        "model": ("models", "import", "FILE", "OUT.toml"),
-    },
+    "drawing": {"info": ("info", "FILE"), "model": ("models", "import", "FILE", "OUT.toml")},
     "kept": {
         "info": ("info", "FILE"),
         "calibration": ("reconstruct", "GOOD.npz", "OUT.npz", "--calibration", "FILE"),

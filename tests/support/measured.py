@@ -15,13 +15,5 @@ def measured(change: FloatArray, weight: FloatArray | float = 1.0) -> Changes:
     even = np.ones(change.shape)
     none, modes = np.zeros(change.shape), np.eye(len(change), len(change) // 2)
     return Changes(
-        change,
-        weights,
-        even,
-        False,
-        1.0,
-        weights**2,
-        variance + (weights == 0),
-        none,
-        modes,
+        change, weights, even, False, 1.0, weights**2, variance + (weights == 0), none, modes
     )

@@ -7,13 +7,7 @@ import hashlib
 import numpy as np
 from tactomo_lab.evaluation.tanks import Tanks
 from tactomo_lab.scenes.drawing import SeedSet
-from tactomo_lab.scenes.simulation import (
-    SHARP_M,
-    UnevenSheet,
-    centroids,
-    fine_mesh,
-    fitted_mesh,
-)
+from tactomo_lab.scenes.simulation import SHARP_M, UnevenSheet, centroids, fine_mesh, fitted_mesh
 from tactomo_lab.tanks.model import pixel_grid
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.mesh import SheetMesh

@@ -12,9 +12,7 @@ VOLTS = np.linspace(-0.5, 0.5, 208)
 
 
 def volts_of(
-    converter: Converter,
-    counter: int = 0,
-    channel: Channel = Channel.MAGNITUDE,
+    converter: Converter, counter: int = 0, channel: Channel = Channel.MAGNITUDE
 ) -> FloatArray:
     counts, _ = converter.convert(VOLTS, channel=channel, counter=counter)
     return np.asarray(counts * converter.volts_per_count)

@@ -241,11 +241,7 @@ class Page:
 @pytest.fixture
 def page(browser: webdriver.Chrome, tmp_path: Path) -> Iterator[Page]:
     # Skins come back at their address: a port may be another program's meanwhile.
-    with (
-        Skin(f"ipc://{tmp_path}/skin") as skin,
-        FakeControl() as daemon,
-        FakeControl() as twin,
-    ):
+    with Skin(f"ipc://{tmp_path}/skin") as skin, FakeControl() as daemon, FakeControl() as twin:
         page = Page(browser, skin, daemon, twin)
         page.serve()
         yield page
@@ -622,7 +618,7 @@ def test_frames_and_status_are_shown_part_by_part(page: Page) -> None:
     page.skin.status |= {"issues": [issue, noted]}
     wait_until(lambda: page["banner"].text == "frames come late: be quick")
     assert page["channels"].text.split("\n")[:4] == [
-        *("frames come late", "be quick", "it hums", "oil it"),
+        *("frames come late", "be quick", "it hums", "oil it")
     ]
     assert page.map_classes == {"pressable"}
     page.skin.status |= {"issues": []}

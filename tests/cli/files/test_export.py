@@ -17,14 +17,7 @@ from fixture_types import Run
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from mcap_ros2.decoder import DecoderFactory as Ros2DecoderFactory
-from recorded_grasp import (
-    FRAMES,
-    PERIOD_NS,
-    SENSOR,
-    START_NS,
-    contacts_of,
-    write_grasp,
-)
+from recorded_grasp import FRAMES, PERIOD_NS, SENSOR, START_NS, contacts_of, write_grasp
 from small_sensor import SMALL
 from tactomo.cli.files.recorded_frames import recorded_frames
 from tactomo.cli.plot.course import read_course

@@ -12,15 +12,7 @@ from fixture_types import Run
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from numpy.typing import NDArray
-from recorded_grasp import (
-    FRAMES,
-    PERIOD_NS,
-    SENSOR,
-    START_NS,
-    contacts_of,
-    images_of,
-    write_grasp,
-)
+from recorded_grasp import FRAMES, PERIOD_NS, SENSOR, START_NS, contacts_of, images_of, write_grasp
 
 PRESSED = 50
 FLAGGED = 33

@@ -112,7 +112,7 @@ def test_the_batch_layout_keeps_channels_reference_and_gaps(tactomo: Run, tmp_pa
     recording = open_recording(tmp_path / "out.mcap")
     read = [scan for _, scan in scans(recording)]
     assert [(s.counter, s.channel.name[0]) for s in read] == [
-        *((0, "M"), (0, "S"), (1, "M"), (1, "S"), (2, "M"), (3, "M"), (3, "S")),
+        *((0, "M"), (0, "S"), (1, "M"), (1, "S"), (2, "M"), (3, "M"), (3, "S"))
     ]
     assert read[3].samples == pytest.approx(arrays["structure"][1], rel=1e-6)
     reference = recording.first_reference()
@@ -136,7 +136,7 @@ def test_readings_of_companions_are_kept(tactomo: Run, tmp_path: Path) -> None:
     packets = [p for _, data in recording.chunks(0) for p in decoder.feed(data)]
     kept = [p for p in packets if isinstance(p, CompanionReading)]
     assert [(p.index, p.device_us, p.value) for p in kept] == [
-        *((7, 0, 1.0), (7, 50_000, 2.0), (7, 150_000, 4.0)),
+        *((7, 0, 1.0), (7, 50_000, 2.0), (7, 150_000, 4.0))
     ]
     reference = recording.first_reference()
     assert reference is not None

@@ -71,9 +71,7 @@ def shared_mb(pid: int) -> float:
 
 
 @pytest.mark.slow
-def test_each_skin_is_served_and_found_by_its_name(
-    start: Callable[..., Robot],
-) -> None:
+def test_each_skin_is_served_and_found_by_its_name(start: Callable[..., Robot]) -> None:
     robot = start()
     robot.wait_ready()
     for name in NAMES:
@@ -121,9 +119,7 @@ def test_all_of_them_end_with_the_command(start: Callable[..., Robot], number: i
 
 
 @pytest.mark.slow
-def test_one_that_dies_is_started_again_and_the_other_goes_on(
-    start: Callable[..., Robot],
-) -> None:
+def test_one_that_dies_is_started_again_and_the_other_goes_on(start: Callable[..., Robot]) -> None:
     robot = start()
     robot.wait_ready()
     before = {name: robot.status(name) for name in NAMES}
@@ -181,9 +177,7 @@ def test_one_that_hangs_is_killed_and_started_again(start: Callable[..., Robot])
 
 
 @pytest.mark.slow
-def test_where_none_can_start_the_command_fails_with_the_reasons(
-    tmp_path: Path,
-) -> None:
+def test_where_none_can_start_the_command_fails_with_the_reasons(tmp_path: Path) -> None:
     skins = {name: {"ports": [f"/absent/{name}"]} for name in NAMES}
     process = DaemonProcess(tmp_path, [], ready=False, skins=skins)
     assert process.popen.wait(PATIENCE_S) == 1

@@ -278,10 +278,7 @@ def test_record_start_gives_a_name(tactomo: Run, control: Any) -> None:
     control.answers["record_start"] = {"path": "/x.mcap"}
     tactomo("record", "start", "x.mcap", status=0)
     tactomo("record", "start", status=0)
-    assert control.requests == [
-        ("record_start", {"path": "x.mcap"}),
-        ("record_start", {}),
-    ]
+    assert control.requests == [("record_start", {"path": "x.mcap"}), ("record_start", {})]
 
 
 def test_record_a_file_for_some_seconds(
@@ -341,13 +338,7 @@ def test_tier_and_budget(tactomo: Run, control: Any) -> None:
 def test_poke_sends_numbers_as_numbers(tactomo: Run, control: Any) -> None:
     control.answers["mute"] = {"done": True}
     result = tactomo(
-        "poke",
-        "mute",
-        "channel=structure",
-        "seconds=2.5",
-        "port=1",
-        "--address",
-        control.address,
+        "poke", "mute", "channel=structure", "seconds=2.5", "port=1", "--address", control.address
     )
     assert json.loads(result.stdout) == {"done": True}
     assert control.requests == [("mute", {"channel": "structure", "seconds": 2.5, "port": 1})]

@@ -76,11 +76,7 @@ def test_a_microcontroller_has_no_latency_timer_and_our_own_rules_name_goes_firs
 
 
 @pytest.mark.parametrize(
-    ("number", "line"),
-    [
-        ("188:0", "E:ID_MM_PORT_IGNORE=1"),
-        ("189:13", "E:ID_MM_DEVICE_IGNORE=1"),
-    ],
+    ("number", "line"), [("188:0", "E:ID_MM_PORT_IGNORE=1"), ("189:13", "E:ID_MM_DEVICE_IGNORE=1")]
 )
 def test_modem_manager_is_known_to_be_kept_away(
     machine: FakeMachine, number: str, line: str

@@ -18,11 +18,7 @@ def device() -> Liveness:
 
 @pytest.mark.parametrize(
     ("packets", "scans", "state"),
-    [
-        (0, 0, DeviceState.GARBLED),
-        (1, 0, DeviceState.IDLE),
-        (2, 1, DeviceState.RUNNING),
-    ],
+    [(0, 0, DeviceState.GARBLED), (1, 0, DeviceState.IDLE), (2, 1, DeviceState.RUNNING)],
 )
 def test_what_comes_says_how_it_does(
     device: Liveness, packets: int, scans: int, state: DeviceState

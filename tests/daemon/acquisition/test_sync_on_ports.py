@@ -97,9 +97,7 @@ def test_a_saturated_scan_is_used_and_flagged(bench: Start) -> None:
     assert frame["map"] is not None
 
 
-def test_voltages_that_are_no_numbers_are_left_to_the_models_and_never_tared(
-    bench: Start,
-) -> None:
+def test_voltages_that_are_no_numbers_are_left_to_the_models_and_never_tared(bench: Start) -> None:
     b = bench().tare()
     line = b.skin.lines[0]
     counter = b.skin.counter + 1

@@ -226,10 +226,7 @@ def test_a_replay_goes_by_each_calibration_from_its_frame_on(
 
 @pytest.mark.slow
 def test_files_that_were_cut_replay_by_the_calibration_of_each(
-    bench: Start,
-    replay: Start,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    bench: Start, replay: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A file is begun, then the calibration changes, then the first frame comes into that file."""
     monkeypatch.setattr(recorder, "LOOK_S", 0.3)

@@ -112,10 +112,7 @@ def test_exchanged_source_and_sink_turn_the_sign() -> None:
     assert numbers(Sciospec(TANK).feed(b"".join(turned))) == [1, 2, 3, 4, 5]
 
 
-@pytest.mark.parametrize(
-    ("electrodes", "pattern"),
-    [(8, 1), (16, 3), (16, 8), (32, 1), (32, 16)],
-)
+@pytest.mark.parametrize(("electrodes", "pattern"), [(8, 1), (16, 3), (16, 8), (32, 1), (32, 16)])
 def test_any_pattern_of_8_16_and_32_electrodes(
     tmp_path: Path, electrodes: int, pattern: int
 ) -> None:

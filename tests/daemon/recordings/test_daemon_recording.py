@@ -73,9 +73,7 @@ def test_a_replay_leaves_out_what_the_live_run_dropped(
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("module", "name"),
-    [(frame_log, "Entry"), (daemon, "Entry")],
-    ids=["mark", "map"],
+    ("module", "name"), [(frame_log, "Entry"), (daemon, "Entry")], ids=["mark", "map"]
 )
 def test_a_frame_that_was_seen_is_in_the_recording(
     bench: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: Any, name: str

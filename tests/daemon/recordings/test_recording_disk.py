@@ -179,9 +179,7 @@ def test_a_stuck_disk_holds_up_nothing_and_costs_nothing(
 
 @pytest.mark.slow
 def test_a_disk_that_stays_stuck_ends_the_recording_when_enough_waits(
-    bench: Start,
-    stuck_disk: tuple[Path, Callable[[str], None]],
-    monkeypatch: pytest.MonkeyPatch,
+    bench: Start, stuck_disk: tuple[Path, Callable[[str], None]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recording_writer, "MAX_QUEUED_BYTES", 200_000)
     disk, turn = stuck_disk

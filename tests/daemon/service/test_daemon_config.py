@@ -7,13 +7,7 @@ from pathlib import Path
 
 import pytest
 from pydantic import BaseModel
-from tactomo.config import (
-    BaselineConfig,
-    DaemonConfig,
-    RecordingConfig,
-    load_config,
-    load_skins,
-)
+from tactomo.config import BaselineConfig, DaemonConfig, RecordingConfig, load_config, load_skins
 from tactomo.errors import ConfigError
 
 EXAMPLE = Path(__file__).parents[3] / "deploy" / "daemon.example.toml"

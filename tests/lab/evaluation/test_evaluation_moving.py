@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tactomo_lab.evaluation.moving import (
-    Step,
-    choreography,
-    follow,
-)
+from tactomo_lab.evaluation.moving import Step, choreography, follow
 from tactomo_lab.evaluation.play import play
 from tactomo_lab.scenes.case import Case, Simulated, SimulatedVolts, as_described
 from tactomo_lab.scenes.drawing import BOTH_CHANNELS, GAP_M, gap_m, outline_of

@@ -20,12 +20,7 @@ from tactomo_lab.scenes.drawing import (
     outline_of,
     seed_of,
 )
-from tactomo_lab.scenes.simulation import (
-    UnevenSkin,
-    fine_mesh,
-    truth_of,
-    with_contrast,
-)
+from tactomo_lab.scenes.simulation import UnevenSkin, fine_mesh, truth_of, with_contrast
 from tactomo_models import DataError, Press, SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.mesh import SheetMesh, mesh_sheet

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tactomo_lab.evaluation.field import (
-    STILL_ROWS,
-    cases_of_row,
-    frames_of_row,
-)
+from tactomo_lab.evaluation.field import STILL_ROWS, cases_of_row, frames_of_row
 from tactomo_lab.evaluation.moving import draw_sequence
 from tactomo_lab.evaluation.play import play
 from tactomo_lab.evaluation.regimes import make_case

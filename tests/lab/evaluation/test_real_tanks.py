@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 from shared_data import measured
 from tactomo_lab.evaluation.presses import IMAGE, TAUGHT, localise, read_presses
-from tactomo_lab.evaluation.tanks import (
-    TankImager,
-    Tanks,
-    evaluate_tanks,
-    read_tanks,
-)
+from tactomo_lab.evaluation.tanks import TankImager, Tanks, evaluate_tanks, read_tanks
 from tactomo_models import load_description
 
 pytestmark = pytest.mark.slow

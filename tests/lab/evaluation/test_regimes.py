@@ -13,12 +13,7 @@ from tactomo_lab.evaluation.regimes import KINDS, REGIMES, draw_plan, make_case
 from tactomo_lab.scenes.case import Case, Plan
 from tactomo_lab.scenes.drawing import BOTH_CHANNELS, gap_m, outline_of
 from tactomo_lab.scenes.measures import Score, summarise
-from tactomo_lab.scenes.simulation import (
-    SheetState,
-    UnevenSkin,
-    displaced,
-    fine_mesh,
-)
+from tactomo_lab.scenes.simulation import SheetState, UnevenSkin, displaced, fine_mesh
 from tactomo_models import Reconstructor, SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics import tikhonov as linear
@@ -192,9 +187,7 @@ def test_regularisation_is_so_many_times_what_the_rule_chooses(
     assert np.abs(right - expected).max() > 0.1 * top
 
 
-def test_a_case_is_judged_by_its_last_frame(
-    small: SensorDescription,
-) -> None:
+def test_a_case_is_judged_by_its_last_frame(small: SensorDescription) -> None:
     case = case_of(small, "jump")
     (outcome,) = frames_of_row(small, "jump", "tikhonov", "tuning", 1)["jump"]
     alone = Reconstructor(case.description, method="tikhonov")

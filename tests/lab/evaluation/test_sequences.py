@@ -8,13 +8,7 @@ from itertools import combinations, pairwise
 import numpy as np
 import pytest
 from tactomo_lab.evaluation.field import frames_of_row
-from tactomo_lab.evaluation.moving import (
-    COMING,
-    Step,
-    mixed_sequence,
-    mixed_steps,
-    palm_sequence,
-)
+from tactomo_lab.evaluation.moving import COMING, Step, mixed_sequence, mixed_steps, palm_sequence
 from tactomo_lab.evaluation.play import play
 from tactomo_lab.evaluation.regimes import KINDS, PALM_FRAMES, Draw
 from tactomo_lab.scenes.case import Case, Frame

@@ -100,10 +100,7 @@ def test_a_level_set_knows_one_kind_and_is_refused(tank: SensorDescription) -> N
 
 
 def test_a_file_of_scans_of_such_a_tank(
-    tank: SensorDescription,
-    tank_artifact: Artifact,
-    drawn: Tanks,
-    tmp_path: Path,
+    tank: SensorDescription, tank_artifact: Artifact, drawn: Tanks, tmp_path: Path
 ) -> None:
     """What a user has: volts with objects and without; contacts are of both kinds."""
     empty = ForwardModel(tank, tank_artifact.bare).bare_voltages

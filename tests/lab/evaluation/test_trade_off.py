@@ -8,13 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tactomo_lab.commands.chart import (
-    Point,
-    panels,
-    pareto_front,
-    points_of,
-    variants,
-)
+from tactomo_lab.commands.chart import Point, panels, pareto_front, points_of, variants
 from tactomo_lab.evaluation.play import Variant, play
 from tactomo_lab.scenes.case import draw_still, still_case
 from tactomo_lab.scenes.measures import summarise
@@ -62,9 +56,7 @@ def test_every_method_has_a_point_and_auto_and_fit_one_for_every_budget() -> Non
 
 
 @pytest.mark.slow
-def test_still_scenes_are_measured_under_each_budget(
-    paper: SensorDescription,
-) -> None:
+def test_still_scenes_are_measured_under_each_budget(paper: SensorDescription) -> None:
     drawn = [still_case(paper, draw_still(paper, "tuning", 3, 0), "tuning", 0, 20.0)]
     asked = [Variant("tikhonov"), Variant("fit", 0.001), Variant("fit", 0.2)]
     linear, hasty, patient = points_of(play(drawn, *asked))

@@ -25,11 +25,7 @@ from tactomo_lab.training.train import (
     train,
 )
 from tactomo_lab.training.training_scenes import FORMAT, simulate
-from tactomo_models import (
-    ModelError,
-    SensorDescription,
-    load_description,
-)
+from tactomo_models import ModelError, SensorDescription, load_description
 from tactomo_models.methods.trained_networks import (
     FusionNetwork,
     Network,

@@ -139,9 +139,7 @@ def test_a_palm_that_comes_is_one_contact(
     palm = Press(0.0, 0.0, kpa, radius_m=diameter_m / 2)
     step_s = max(comes_s / 300, 0.025)
     frames = life.lives(
-        comes_s,
-        step_s=step_s,
-        presses_at=lambda share: (replace(palm, pressure_kpa=share * kpa),),
+        comes_s, step_s=step_s, presses_at=lambda share: (replace(palm, pressure_kpa=share * kpa),)
     )
     several = [len(frame.contacts) > 1 and not frame.flags for frame in frames]
     assert np.mean(several) < 0.05
@@ -247,11 +245,7 @@ def test_a_skin_with_a_lead_broken_for_good_is_followed_like_any(broken: Life) -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "press",
-    [PRESS, BESIDE_LEAD],
-    ids=["firm", "light, beside it"],
-)
+@pytest.mark.parametrize("press", [PRESS, BESIDE_LEAD], ids=["firm", "light, beside it"])
 def test_a_contact_that_lasts_is_never_erased_where_a_lead_is_broken(
     broken: Life, press: Press
 ) -> None:

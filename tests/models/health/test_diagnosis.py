@@ -96,9 +96,7 @@ def test_a_noisy_lead_is_loose(patient: Patient) -> None:
     assert ill(patient.examine(scans)) == {LEAD: "loose"}
 
 
-def test_a_lead_that_opens_now_and_then_is_loose_and_not_the_whole_device(
-    patient: Patient,
-) -> None:
+def test_a_lead_that_opens_now_and_then_is_loose_and_not_the_whole_device(patient: Patient) -> None:
     rest = patient.rest()
     scans = patient.scans(rest)
     scans[[7, 20, 41]] += BAD_LEADS["open, reads 0 V"](patient.description, rest, LEAD) - rest
@@ -197,11 +195,7 @@ def test_one_scan_is_enough_for_reciprocity_and_none_is_not(patient: Patient) ->
         patient.examine(np.ones((3, 200)))
 
 
-@given(
-    electrodes=st.integers(8, 24),
-    drive=st.integers(1, 4),
-    measure=st.integers(1, 4),
-)
+@given(electrodes=st.integers(8, 24), drive=st.integers(1, 4), measure=st.integers(1, 4))
 def test_a_pattern_is_read_off_its_zeros(electrodes: int, drive: int, measure: int) -> None:
     pairs = scan_pairs(electrodes, drive, measure)
     full = np.zeros((2, electrodes, electrodes))

@@ -210,10 +210,7 @@ def test_a_skin_far_from_even_is_no_other_sensor_but_one_that_is_pressed_is_flag
 
 @pytest.mark.slow
 def test_the_doctor_knows_a_skin_made_by_hand(
-    paper: SensorDescription,
-    artifact: Artifact,
-    at_tare: dict[Channel, FloatArray],
-    pressed: bool,
+    paper: SensorDescription, artifact: Artifact, at_tare: dict[Channel, FloatArray], pressed: bool
 ) -> None:
     scans = at_tare[Channel.STRUCTURE] * np.ones((20, 1))
     found = {each.about: each.level for each in diagnose(paper, scans, even=artifact.bare).findings}

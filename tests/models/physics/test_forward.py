@@ -10,11 +10,7 @@ from pyeit.eit import fem, protocol  # type: ignore[import-untyped]
 from pyeit.mesh import PyEITMesh  # type: ignore[import-untyped]
 from tactomo_models import Artifact, SensorDescription, load_description
 from tactomo_models.arrays import FloatArray
-from tactomo_models.physics.bare_sheet import (
-    scan_voltages,
-    solve_bare_sheet,
-    transfer_resistances,
-)
+from tactomo_models.physics.bare_sheet import scan_voltages, solve_bare_sheet, transfer_resistances
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
 from taylor import taylor_orders
@@ -115,9 +111,7 @@ spots = st.lists(
 
 @given(spots)
 def test_whatever_is_pressed_equals_a_solve_of_the_whole_system(
-    sheet: SheetMesh,
-    uneven: ForwardModel,
-    spots: list[tuple[float, float, float, float, float]],
+    sheet: SheetMesh, uneven: ForwardModel, spots: list[tuple[float, float, float, float, float]]
 ) -> None:
     """Discs and rings of sharp edge: apart, in one another, at the frame, over the whole sheet."""
     x, y = uneven.bare.points[:, uneven.bare.pressable]
@@ -175,9 +169,7 @@ def test_a_larger_sheet_leaves_as_much_to_be_solved(small: SensorDescription) ->
 def halved(small: SensorDescription) -> list[ForwardModel]:
     """One sheet at halved spacings, each electrode a whole number of edges."""
     aligned = variant(
-        small,
-        sheet={"height_m": 0.06, "frame_width_m": 0.0149},
-        electrodes={"pitch_m": 0.024},
+        small, sheet={"height_m": 0.06, "frame_width_m": 0.0149}, electrodes={"pitch_m": 0.024}
     )
     return [
         ForwardModel(aligned, solve_bare_sheet(aligned, mesh_sheet(aligned, spacing_m)))

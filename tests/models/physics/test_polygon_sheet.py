@@ -182,10 +182,7 @@ def bump(forward: ForwardModel, place: tuple[float, float]) -> FloatArray:
 
 @pytest.mark.parametrize(
     ("name", "place"),
-    [
-        ("palm_l", (-0.03, -0.03)),
-        pytest.param("insole", (0.0, 0.06), marks=pytest.mark.slow),
-    ],
+    [("palm_l", (-0.03, -0.03)), pytest.param("insole", (0.0, 0.06), marks=pytest.mark.slow)],
 )
 def test_voltages_converge_and_the_jacobian_passes_a_taylor_test(
     name: str, place: tuple[float, float]

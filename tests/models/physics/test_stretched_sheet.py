@@ -13,11 +13,7 @@ from stretched import Point, along, on_surface
 from tactomo_models import Press, Reconstructor, Reference, SensorDescription, SkinSimulator
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.artifact import build_artifact, load_artifact, save_artifact
-from tactomo_models.physics.bare_sheet import (
-    scan_voltages,
-    solve_bare_sheet,
-    transfer_resistances,
-)
+from tactomo_models.physics.bare_sheet import scan_voltages, solve_bare_sheet, transfer_resistances
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
 from tactomo_models.physics.node_mesh import NodeMesh

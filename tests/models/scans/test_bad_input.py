@@ -169,11 +169,7 @@ def test_a_poor_contact_alone_does_no_harm(show: Show, paper: SensorDescription)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "pair",
-    [(3, 4), (1, 9)],
-    ids=str,
-)
+@pytest.mark.parametrize("pair", [(3, 4), (1, 9)], ids=str)
 @pytest.mark.parametrize("when", ["at the tare", "later"])
 def test_a_short_is_flagged(
     show: Show, simulator: SkinSimulator, pair: tuple[int, int], when: str
@@ -273,12 +269,7 @@ def test_swapped_channels_are_told(show: Show) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("channel", "gain"),
-    [
-        ("magnitude", 0.5),
-        ("magnitude", 1.3),
-        ("structure", 0.7),
-        ("structure", 2.0),
-    ],
+    [("magnitude", 0.5), ("magnitude", 1.3), ("structure", 0.7), ("structure", 2.0)],
 )
 def test_a_gain_that_changes_is_told_as_one_and_not_as_a_swap(
     reconstructor: Reconstructor, skin: Skin, channel: str, gain: float

@@ -12,14 +12,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from noisy_skin import Skin
-from tactomo_models import (
-    Artifact,
-    Flag,
-    Press,
-    Reconstructor,
-    SensorDescription,
-    SkinSimulator,
-)
+from tactomo_models import Artifact, Flag, Press, Reconstructor, SensorDescription, SkinSimulator
 from tactomo_models.methods.magnitudes import BAD_MISFIT
 
 SEEDS = range(7100, 7108)  # nothing was tuned on these
