@@ -9,25 +9,18 @@ from typing import Any
 
 import pytest
 import zmq
-from daemon_bench import PATIENT_SYNC_MS, Bench, Heard, Line, Listener, Memory, Skin
+from daemon_bench import LOCAL, PATIENT_SYNC_MS, Bench, Heard, Line, Listener, Memory, Skin
 from tactomo.config import load_config
 from tactomo.log import configure_logging
 from tactomo.recordings.recording import open_recording
 from tactomo.service.daemon import Daemon
 from tactomo_client import Keys
-from waiting import wait_until
 
 
 @pytest.fixture(autouse=True)
 def _readable_logs() -> None:
     """Log as the daemon does: structlog's own default shows every variable of a traceback."""
     configure_logging("info", "text")
-
-
-@pytest.fixture
-def until() -> Callable[[Callable[[], Any]], Any]:
-    """Wait for a condition and return its value: ``until(lambda: ...)``."""
-    return wait_until
 
 
 @pytest.fixture
@@ -77,11 +70,8 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
         if not is_plugged:
             skin.close()
         settings = {
-            "name": "left",
+            **LOCAL,
             "ports": [str(line.path) for line in skin.lines],
-            "stream": "tcp://127.0.0.1:0",
-            "control": "tcp://127.0.0.1:0",
-            "tare_scans": 3,
             "baseline": {"track": real},  # that takes a real one
             **config,
             "recording": {"folder": tmp_path, **config.get("recording", {})},
@@ -113,11 +103,8 @@ def replay(tmp_path: Path) -> Callable[..., Any]:
     def run(path: Path, speed: float = 0, real: bool = False, **config: Any) -> Heard:
         out = tmp_path / f"replayed-{next(count)}.mcap"
         settings = {
-            "name": "left",
+            **LOCAL,
             "ports": open_recording(path).replay_urls(speed),
-            "stream": "tcp://127.0.0.1:0",
-            "control": "tcp://127.0.0.1:0",
-            "tare_scans": 3,
             "exit_at_end": True,
             "recording": {"file": out, "maps": True},
             "baseline": {"track": real},

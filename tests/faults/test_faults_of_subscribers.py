@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import zmq
 from daemon_process import SENSOR, DaemonProcess
-from ears import percentiles
+from ears import listening, percentiles
 from fixture_types import Figure, Listen, Play, StartProcess
 from pty_skin import Scenes, still
 from tactomo_client import request
@@ -114,14 +114,7 @@ def test_many_subscribers(
 ) -> None:
     daemon = tared()
     rss_mb = daemon.rss_mb
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    sockets = []
-    for _ in range(SUBSCRIBERS):
-        socket = context.socket(zmq.SUB)
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.SUBSCRIBE, topic(SENSOR, "map"))
-        socket.connect(daemon.stream)
-        sockets.append(socket)
+    sockets = [listening(daemon.stream, topic(SENSOR, "map")) for _ in range(SUBSCRIBERS)]
     ears = listen(daemon, "contacts")
     wait_until(lambda: daemon.status()["subscribers"] == SUBSCRIBERS + 1, "all of them")
     playing = play(still(scenes.rest), 20.0)
@@ -141,7 +134,6 @@ def test_many_subscribers(
     published = [heard.published_age_ms for heard in ears.heard]
     for socket in sockets:
         socket.close()
-    context.term()
     figure(
         f"published: {percentiles(published)}; arrived at the last: {percentiles(last_ms[20:])}; "
         f"memory {grown_mb:+.0f} MB"

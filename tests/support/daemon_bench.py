@@ -47,6 +47,11 @@ PATIENT_SYNC_MS = 20_000.0
 """Longer than a daemon may be told to wait for a channel: a stopped computer loses none."""
 BOTH = (Channel.MAGNITUDE, Channel.STRUCTURE)
 NO_FLAGS = ScanFlag(0)
+ANYWHERE = {"stream": "tcp://127.0.0.1:0", "control": "tcp://127.0.0.1:0"}
+LOCAL: dict[str, Any] = {"name": "left", **ANYWHERE, "tare_scans": 3}
+"""Keys of the configuration of a daemon that a test has in its own process."""
+UNUSED: Any = SimpleNamespace(method="auto", budget_s=None, take=None)
+"""The reconstructor of a daemon that makes no frame."""
 
 HELLO = Hello(
     device_id="bench-1",
@@ -161,9 +166,6 @@ class Skin:
             values = REST * (1 + load) if volts is None else volts[channel]
             self.line_of(channel).say(scan(channel, self.counter, values, **details))
         return self.counter
-
-    def wait_until(self, condition: Callable[[], Any]) -> Any:
-        return wait_until(condition)
 
     def close(self) -> None:
         for line in self.lines:

@@ -28,7 +28,7 @@ from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
 from tactomo_models.scene.areas import AreaFinder, Areas
 
 Tared = Callable[..., Reconstructor]
-ONCE = {
+ONCE: dict[str, Callable[..., Any]] = {
     "tactomo_models.simulation.simulator.mesh_sheet": mesh_sheet,
     "tactomo_models.simulation.simulator.solve_bare_sheet": solve_bare_sheet,
     "tactomo_models.methods.method.load_or_build_artifact": load_or_build_artifact,

@@ -73,8 +73,9 @@ def test_matlab_arrays(tactomo: Run, tmp_path: Path) -> None:
     located(tactomo, tmp_path, tmp_path / "a.mat")
     located(tactomo, tmp_path, tmp_path / "c.mat", "--reference", tmp_path / "b.mat")
     scans = read_scans(tmp_path / "d.mat", load_description("tank_disc"), None)
-    np.testing.assert_array_equal(*scans.volts.values(), there)
-    np.testing.assert_array_equal(np.ravel(*scans.reference.values()), rest[0])
+    (volts,), (reference,) = scans.volts.values(), scans.reference.values()
+    np.testing.assert_array_equal(volts, there)
+    np.testing.assert_array_equal(reference.ravel(), rest[0])
     np.testing.assert_array_equal(scans.times(None), times.ravel())
 
 

@@ -7,10 +7,9 @@ import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
+from daemon_bench import LOCAL, UNUSED
 from fixture_types import Start
 from tactomo import timing
 from tactomo.config import load_config
@@ -21,14 +20,10 @@ from tactomo_protocol import Acknowledge, AckStatus, CommandCode
 
 def refusal(port: str | Path) -> PortError:
     """Return the error with which a daemon refuses to start on a port."""
-    memory: Any = SimpleNamespace(method="auto", budget_s=None, take=None)
-    local = "tcp://127.0.0.1:0"
-    config = load_config(
-        None, ports=[str(port)], stream=local, control=local, baseline={"track": False}
-    )
+    config = load_config(None, ports=[str(port)], baseline={"track": False}, **LOCAL)
 
     def start() -> None:
-        daemon = Daemon(config, reconstructor=memory)
+        daemon = Daemon(config, reconstructor=UNUSED)
         try:
             daemon.start()
         finally:

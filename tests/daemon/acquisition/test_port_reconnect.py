@@ -26,9 +26,9 @@ from tactomo.events import EventBook
 from tactomo.timing import LATE_PERIODS
 from tactomo_models import load_description
 from tactomo_protocol import CommandCode
+from waiting import wait_until
 
 Connect = Callable[[object], Connection]
-Until = Callable[[Callable[[], Any]], Any]
 Hold = Callable[..., subprocess.Popen[bytes]]
 
 
@@ -61,14 +61,14 @@ def connect(told: list[tuple[str, str]]) -> Iterator[Connect]:
 
 
 @pytest.fixture
-def hold(until: Until) -> Iterator[Hold]:
+def hold() -> Iterator[Hold]:
     """Start a process that has a port open; it is stopped later."""
     started: list[subprocess.Popen[bytes]] = []
 
     def start(path: Path, *command: str) -> subprocess.Popen[bytes]:
         process = subprocess.Popen([*command, str(path)], stdout=subprocess.DEVNULL)
         started.append(process)
-        until(lambda: any(holder.pid == process.pid for holder in holders(str(path))))
+        wait_until(lambda: any(holder.pid == process.pid for holder in holders(str(path))))
         return process
 
     yield start
@@ -179,13 +179,13 @@ def test_a_permission_that_udev_gives_later_is_waited_for(
 
 
 @pytest.mark.slow
-def test_scans_of_a_newcomer_wait_for_its_hello(bench: Start, until: Until) -> None:
+def test_scans_of_a_newcomer_wait_for_its_hello(bench: Start) -> None:
     b = bench().tare()
     line = b.skin.lines[0]
     line.unplug()
     b.listener.event("port_lost")
     line.plug()
-    until(line.heard)
+    wait_until(line.heard)
     before = b.ask("status")["ports"][0]["unused_scans"]
     b.skin.scan()
     b.listener.wait("status", lambda s: s["ports"][0]["unused_scans"] == before + 2)
@@ -230,7 +230,7 @@ while select.select([port], [], []):
 
 
 @pytest.mark.slow
-def test_one_who_came_later_is_named(bench: Start, hold: Hold, until: Until) -> None:
+def test_one_who_came_later_is_named(bench: Start, hold: Hold) -> None:
     b = bench().tare()
     line = b.skin.lines[0]
     other = hold(line.path, sys.executable, "-c", THIEF)  # root may, whatever the lock
@@ -240,9 +240,9 @@ def test_one_who_came_later_is_named(bench: Start, hold: Hold, until: Until) -> 
         b.skin.scan()
         return any(named in e["detail"] for e in b.listener.of("event"))
 
-    until(is_named)
+    wait_until(is_named)
     stop(other)
-    until(lambda: b.ask("status")["ports"][0]["connected"])
+    wait_until(lambda: b.ask("status")["ports"][0]["connected"])
 
 
 # Those that are there and do not speak
@@ -255,7 +255,7 @@ def _short_patience(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("_short_patience")
-def test_a_silent_device_is_told_and_its_port_opened_anew(bench: Start, until: Until) -> None:
+def test_a_silent_device_is_told_and_its_port_opened_anew(bench: Start) -> None:
     b = bench()
     assert "nothing came" in b.listener.event("device_silent")["detail"]
 
@@ -263,26 +263,26 @@ def test_a_silent_device_is_told_and_its_port_opened_anew(bench: Start, until: U
         (port,) = b.ask("status")["ports"]
         return bool(port["reopened"] and port["connected"] and port["state"] == "silent")
 
-    until(is_open_anew)
+    wait_until(is_open_anew)
 
     def speak() -> bool:
         b.skin.lines[0].say(b.skin.lines[0].hello)
         b.skin.scan()
         return any(e["name"] == "device_speaks" for e in b.listener.of("event"))
 
-    until(speak)
+    wait_until(speak)
     assert "port_lost" not in [e["name"] for e in b.listener.of("event")]
 
 
 @pytest.mark.usefixtures("_short_patience")
-def test_a_device_that_only_babbles_may_have_another_baud_rate(bench: Start, until: Until) -> None:
+def test_a_device_that_only_babbles_may_have_another_baud_rate(bench: Start) -> None:
     b = bench()
 
     def babble() -> bool:
         b.skin.lines[0].say(b"\xf8\x00\x7f\x06")
         return any(e["name"] == "device_garbled" for e in b.listener.of("event"))
 
-    until(babble)
+    wait_until(babble)
     event = b.listener.event("device_garbled")
     assert "no packet of protocol tactomo at 921600 baud" in event["detail"]
     assert "baud" in event["next_step"]
@@ -290,9 +290,7 @@ def test_a_device_that_only_babbles_may_have_another_baud_rate(bench: Start, unt
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_short_patience")
-def test_a_device_that_says_hello_and_nothing_else_is_asked_to_start(
-    bench: Start, until: Until
-) -> None:
+def test_a_device_that_says_hello_and_nothing_else_is_asked_to_start(bench: Start) -> None:
     b = bench()
     codes: list[int] = []
     spoke_s: list[float] = []
@@ -303,15 +301,15 @@ def test_a_device_that_says_hello_and_nothing_else_is_asked_to_start(
         codes.extend(command.code for command in b.skin.lines[0].heard())
         return any(e["name"] == "device_idle" for e in b.listener.of("event"))
 
-    until(greet)
-    until(lambda: greet() and codes.count(CommandCode.START) >= 2)
+    wait_until(greet)
+    wait_until(lambda: greet() and codes.count(CommandCode.START) >= 2)
 
-    def idle_port() -> dict[str, Any] | None:  # it speaks on: a pause would be silence
+    def idle_port() -> Any:  # it speaks on: a pause would be silence
         greet()
         (port,) = b.ask("status")["ports"]
         return port if port["state"] == "idle" else None
 
-    port = until(idle_port)
+    port = wait_until(idle_port)
     pauses_s = [later - earlier for earlier, later in pairwise(spoke_s)]
     assert port["reopened"] == 0 or max(pauses_s) >= PATIENCE_S / 10  # a computer that stopped
     assert port["problem"] == "the device speaks, but sends no scans"
@@ -319,7 +317,7 @@ def test_a_device_that_says_hello_and_nothing_else_is_asked_to_start(
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("_short_patience")
-def test_a_slow_board_runs_between_its_frames_until_it_stops(bench: Start, until: Until) -> None:
+def test_a_slow_board_runs_between_its_frames_until_it_stops(bench: Start) -> None:
     """Its protocol gives the first frame 4 s; then its own pace counts, here one frame a second."""
     count = load_description("matrix_square").measurements
     line = b",".join(b"%d" % (1000 + number) for number in range(count)) + b"\n"
@@ -328,7 +326,7 @@ def test_a_slow_board_runs_between_its_frames_until_it_stops(bench: Start, until
 
     def a_second_later() -> None:
         end_s = time.monotonic() + 1.0
-        until(lambda: time.monotonic() >= end_s)
+        wait_until(lambda: time.monotonic() >= end_s)
 
     def frames_of(sent: int) -> bool:
         return bool(b.ask("status")["frames"] >= sent)
@@ -338,7 +336,7 @@ def test_a_slow_board_runs_between_its_frames_until_it_stops(bench: Start, until
         a_second_later()
         said_s.append(time.monotonic())
         b.skin.lines[0].say(line)
-        until(partial(frames_of, sent))
+        wait_until(partial(frames_of, sent))
         longest_s = max(longest_s, time.monotonic() - said_s[-2:][0])
     a_second_later()  # longer than others are given
     status = b.ask("status")
@@ -354,12 +352,10 @@ def test_a_slow_board_runs_between_its_frames_until_it_stops(bench: Start, until
 # Noise
 
 
-def test_a_device_that_does_not_listen_is_heard_all_the_same(
-    line: Any, connect: Connect, until: Until
-) -> None:
+def test_a_device_that_does_not_listen_is_heard_all_the_same(line: Any, connect: Connect) -> None:
     connection = connect(line.path)
     connection.open()
-    until(lambda: not connection.write(bytes(1000)))  # what it does not read fills the line
+    wait_until(lambda: not connection.write(bytes(1000)))  # what it does not read fills the line
     assert connection.is_open
     line.say(b"still here")
     assert connection.read() == b"still here"

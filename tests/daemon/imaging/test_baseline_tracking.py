@@ -89,8 +89,3 @@ def test_a_change_that_no_skin_makes_is_refused_and_a_tare_helps(
         b.step(volts=cold)
     assert [e["name"] for e in b.listener.of("event")].count("baseline_refused") == 1
     assert b.ask("status")["baseline"]["state"] == "refused"
-
-
-def test_off_means_off(bench: Start) -> None:
-    b = bench(baseline={"track": False}).tare()
-    assert b.ask("status")["baseline"]["state"] == "off"

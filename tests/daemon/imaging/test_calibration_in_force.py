@@ -183,13 +183,9 @@ class Pressed:
 
     @property
     def live(self) -> dict[int, Any]:
-        """Pressures since the tare, or since the last `forget`."""
+        """Pressures since the tare."""
         found = pressures(self.bench.listener.of("contacts"))
         return {counter: kpa for counter, kpa in found.items() if counter >= self._first}
-
-    def forget(self) -> None:
-        """Leave out of `live` what was until now."""
-        self._first = self.bench.skin.counter + 1
 
 
 def pressures(frames: list[dict[str, Any]]) -> dict[int, list[float]]:

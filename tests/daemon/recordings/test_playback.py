@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from daemon_bench import HELLO, Bench, Listener, Memory, scan
+from daemon_bench import HELLO, LOCAL, Bench, Listener, Memory, scan
 from fixture_types import Start
 from tactomo.config import load_config
 from tactomo.imaging.imaging import MOVED_BUDGET_MS
@@ -32,11 +32,8 @@ def play(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
 
     def start(path: Path, start_s: float = 0.0, speed: float = 1.0, seconds: float = 0.0) -> Bench:
         settings = {
-            "name": "left",
+            **LOCAL,
             "ports": open_recording(path).replay_urls(speed),
-            "stream": "tcp://127.0.0.1:0",
-            "control": "tcp://127.0.0.1:0",
-            "tare_scans": 3,
             "baseline": {"track": False},
         }
         memory: Any = Memory(seconds)

@@ -9,10 +9,10 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from daemon_bench import LOCAL, UNUSED
 from daemon_process import DaemonProcess
 from fixture_types import Start
 from tactomo.config import load_config
@@ -85,17 +85,16 @@ def test_nothing_is_left_after_a_start_that_failed(bench: Start, tmp_path: Path)
     Path(bad).touch()
     threads = set(threading.enumerate())
     before = len(os.listdir("/proc/self/fd"))
-    memory: Any = SimpleNamespace(method="auto", budget_s=None, take=None)
     off = {"track": False}
-    local = {"stream": "tcp://127.0.0.1:0", "control": "tcp://127.0.0.1:0"}
     taken = b.daemon.control_address
     for settings, says in (
-        ({"ports": [good, bad], **local}, bad),
-        ({"ports": [good], **local, "control": taken}, taken),
-        ({"ports": [good], "recording": {"file": "/proc/none/s.mcap"}, **local}, "/proc/none"),
+        ({"ports": [good, bad]}, bad),
+        ({"ports": [good], "control": taken}, taken),
+        ({"ports": [good], "recording": {"file": "/proc/none/s.mcap"}}, "/proc/none"),
     ):
+        config = load_config(baseline=off, **LOCAL | settings)
         with pytest.raises(TactomoError, match=re.escape(says)):
-            Daemon(load_config(baseline=off, **settings), reconstructor=memory).start()
+            Daemon(config, reconstructor=UNUSED).start()
     b.until(lambda: len(os.listdir("/proc/self/fd")) <= before)
     assert set(threading.enumerate()) <= threads
     for descriptor in free:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import threading
-from types import SimpleNamespace
 from typing import Any
 
 import msgpack  # type: ignore[import-untyped]
 import pytest
 import zmq
-from daemon_bench import Memory
+from daemon_bench import LOCAL, UNUSED, Memory
 from fixture_types import Start
 from tactomo.config import load_config
 from tactomo.errors import AddressError
@@ -38,6 +37,7 @@ def test_status_says_how_everything_is(bench: Start) -> None:
     assert status["sequence"] >= 1
     assert status["tier"] == "tikhonov"
     assert status["recording"] is None
+    assert status["baseline"]["state"] == "off"  # as the bench's configuration has it
     assert status["subscribers"] == 5
     assert set(b.listener.of("status")[-1]) == set(status)
 
@@ -229,11 +229,8 @@ def test_an_address_in_use_is_refused_and_nothing_is_left_open(
     other = f"ipc://{tmp_path}/socket" if transport == "ipc" else "tcp://127.0.0.1:0"
     b = bench(**{purpose: other})
     taken = getattr(b.daemon, f"{purpose}_address")
-    free = "tcp://127.0.0.1:0"
-    settings: dict[str, Any] = {"stream": free, "control": free, purpose: taken}
-    settings["baseline"] = {"track": False}
-    memory: Any = SimpleNamespace(method="auto", budget_s=None, take=None)
-    second = Daemon(load_config(ports=["/dev/null"], **settings), reconstructor=memory)
+    settings = {**LOCAL, "baseline": {"track": False}, purpose: taken}
+    second = Daemon(load_config(ports=["/dev/null"], **settings), reconstructor=UNUSED)
     before = threading.active_count()
     with pytest.raises(AddressError, match="in use") as caught:
         second.start()
