@@ -84,12 +84,12 @@ def ros_messages(
             the sensor's own frame. Contacts know their link themselves.
     """
     types = topic_types(frame.sensor)
-    cloud, contacts, wrenches, poses, tf, diagnostics = types
+    cloud, contacts, wrenches, poses, tf, _ = types
     header = _new("std_msgs/msg/Header", stamp=_stamp(time_ns), frame_id=frame.sensor)
     level = "STALE" if frame.is_stale else "WARN" if frame.flags else "OK"
     told = "stale" if frame.is_stale else ", ".join(sorted(frame.flags)) or "ok"
-    trust = _diagnostics(frame.sensor, header, told, _trust(frame, age_s), level)
-    said: list[tuple[str, Any]] = [(diagnostics, trust)]
+    yield _diagnostics(frame.sensor, time_ns, told, _trust(frame, age_s), level)
+    said: list[tuple[str, Any]] = []
     if (points := _map_points(frame, mount)) is not None:
         said.append((cloud, _cloud(points, header if mount is None else _in(header, mount.frame))))
     of_contacts = _in(header, next((c.frame for c in frame.contacts if c.frame), frame.sensor))
@@ -270,7 +270,7 @@ def stale_diagnostics(sensor: str, frame: Frame | None, now_ns: int) -> RosMessa
     """Return that no frame comes; `frame` is the last that came, None where none ever did."""
     known = {} if frame is None else _trust(frame, frame.age_s)
     told = "no frame yet" if frame is None else f"no frame for {frame.age_s:.1f} s"
-    return _diagnosed(sensor, now_ns, f"{told}: is the daemon running?", known, "STALE")
+    return _diagnostics(sensor, now_ns, f"{told}: is the daemon running?", known, "STALE")
 
 
 def issue_diagnostics(status: Status, now_ns: int) -> RosMessage:
@@ -279,16 +279,7 @@ def issue_diagnostics(status: Status, now_ns: int) -> RosMessage:
     level = "ERROR" if "error" in severities else "WARN" if severities else "OK"
     told = "; ".join(issue.what for issue in status.issues) or status.state
     steps = {issue.what: issue.next_step for issue in status.issues}
-    return _diagnosed(status.sensor, now_ns, told, steps, level, ": daemon")
-
-
-def _diagnosed(
-    sensor: str, now_ns: int, told: str, known: Mapping[str, Any], level: str, part: str = ""
-) -> RosMessage:
-    header = _new("std_msgs/msg/Header", stamp=_stamp(now_ns), frame_id=sensor)
-    message = _diagnostics(sensor, header, told, known, level, part)
-    kind = topic_types(sensor)["/diagnostics"]
-    return RosMessage("/diagnostics", kind, bytes(TYPES.serialize_cdr(message, kind)))
+    return _diagnostics(status.sensor, now_ns, told, steps, level, ": daemon")
 
 
 def _trust(frame: Frame, age_s: float | None) -> dict[str, Any]:
@@ -306,8 +297,8 @@ def _trust(frame: Frame, age_s: float | None) -> dict[str, Any]:
 
 
 def _diagnostics(
-    sensor: str, header: Any, told: str, known: Mapping[str, Any], level: str, part: str = ""
-) -> Any:
+    sensor: str, now_ns: int, told: str, known: Mapping[str, Any], level: str, part: str = ""
+) -> RosMessage:
     status: Any = TYPES.types["diagnostic_msgs/msg/DiagnosticStatus"]
     values = [
         _new("diagnostic_msgs/msg/KeyValue", key=key, value=str(value))
@@ -321,4 +312,7 @@ def _diagnostics(
         hardware_id=sensor,
         values=values,
     )
-    return _new("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[one])
+    header = _new("std_msgs/msg/Header", stamp=_stamp(now_ns), frame_id=sensor)
+    message = _new("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[one])
+    kind = topic_types(sensor)["/diagnostics"]
+    return RosMessage("/diagnostics", kind, bytes(TYPES.serialize_cdr(message, kind)))
