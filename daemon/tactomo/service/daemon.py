@@ -298,10 +298,8 @@ class Daemon:
                 self._why_stopped = "every replayed port is at its end"
                 break
             has_access = self._access is None or self._access.is_alive
-            if not has_access or not all(
-                worker.is_alive for worker in self._workers
-            ):  # see the log
-                self._why_stopped = "a thread died"
+            if not (has_access and all(worker.is_alive for worker in self._workers)):
+                self._why_stopped = "a thread died"  # its traceback is in the log
                 log.error("thread_died", next_step="please report the traceback above")
                 return 1
             supervision.turn()
