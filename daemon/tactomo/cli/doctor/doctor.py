@@ -11,6 +11,7 @@ import typer
 from tactomo.cli import options
 from tactomo.cli.output import print_json, say
 from tactomo.cli.sensors import find_sensor
+from tactomo.errors import TactomoError
 from tactomo.plain import plain
 
 if TYPE_CHECKING:
@@ -134,7 +135,6 @@ def _of_file(
     from tactomo_models.array_files import READERS
 
     from tactomo.cli.doctor.evidence import of_arrays, of_recording
-    from tactomo.errors import TactomoError
 
     suffix = what.suffix.lower()
     if suffix == ".mcap":

@@ -12,17 +12,15 @@ import time
 import webbrowser
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from tactomo.cli import options
+from tactomo.cli.children import ProcessGroup, interrupt_at_end, new_group, print_ready
 from tactomo.cli.output import say
 from tactomo.endpoint import free_addresses
 from tactomo.running import Running, announced, running
-
-if TYPE_CHECKING:
-    from tactomo.cli.children import ProcessGroup
 
 TARE_PATIENCE_S = 10.0
 
@@ -66,8 +64,6 @@ def demo(
     writes recordings into this folder. The page presses the skin by itself until somebody presses
     it.
     """
-    from tactomo.cli.children import new_group
-
     stream, control, twin_control = free_of(
         (stream, options.DEFAULT_STREAM),
         (control, options.DEFAULT_CONTROL),
@@ -136,8 +132,6 @@ def show_replay(
     more: list[str],
 ) -> None:
     """Play a recording through a daemon and show it in the viewer until Ctrl-C."""
-    from tactomo.cli.children import new_group
-
     with new_group() as group:
         daemon = group.start(
             *("replay", "replay", str(recording), "--speed", speed, "--sensor", sensor),
@@ -176,8 +170,6 @@ def _open_page(
 
 def _stay(group: ProcessGroup, addresses: Mapping[str, Any], announce: bool) -> None:
     """Tell the user where everything is, and stay until something ends."""
-    from tactomo.cli.children import print_ready
-
     if announce:
         print_ready(addresses)
     else:
@@ -269,7 +261,6 @@ def twin(
     """
     from tactomo_models import load_description
 
-    from tactomo.cli.children import interrupt_at_end, print_ready
     from tactomo.twin import Twin, TwinConfig, load_scene
 
     interrupt_at_end()
