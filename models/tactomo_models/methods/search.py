@@ -255,66 +255,43 @@ class Search:
     # Starts
 
     def _cold(self, frame: Frame) -> Belief:
-        """The best of what is proposed, and of nothing."""
+        """What is proposed, or nothing: any contact at all explains more than none."""
         frame.budget.left_s -= COLD_S
-        nothing = self._account(np.zeros((0, COLUMNS)), self.fit.likely, frame)
-        starts = [nothing]
-        for each in self._proposed(frame):
-            if len(starts) == 2:  # the same as one: not where several explain the data
-                starts[1] = self._descended(starts[1], frame, FEW_STEPS)
-                if frame.likelihood.explains(starts[1].chi_squared):
-                    break
-            starts.append(self._account(each, self.fit.likely, frame))
-        best = self._best(starts, frame)
-        return self._begun(best, frame, "cold start" if best.family.count == 0 else "proposed")
+        starts = [self._nothing(frame), *self._proposed(frame)]
+        best = min(starts, key=lambda one: one.fitted.cost)
+        return self._begun(best, frame, "proposed" if best.family.count else "cold start")
 
-    def _proposed(self, frame: Frame) -> Iterator[FloatArray]:
-        """What a network proposes (K, COLUMNS), then the same as one that it fills half of."""
+    def _nothing(self, frame: Frame) -> Account:
+        return self._account(np.zeros((0, COLUMNS)), self.fit.likely, frame)
+
+    def _proposed(self, frame: Frame) -> list[Account]:
+        """What a network proposes, where it proposes any contact."""
         each = frame.propose()[:MAX_CONTACTS] if frame.propose else np.zeros((0, COLUMNS))
         each[:, PEAK] = self._start_peak(frame)
-        if len(each):
-            yield each
-        if len(each) > 1:
-            one = as_one(each)
-            if np.exp(2 * each[:, SIZE]).sum() > np.exp(2 * one[SIZE]) / 2:
-                yield one[None]
-
-    def _best(self, starts: list[Account], frame: Frame) -> Account:
-        """The likeliest of starts, after a few steps each; there is at least one."""
-        if len(starts) == 2 and starts[0].family.count == 0:
-            # Any contact at all explains more than none.
-            starts = [min(starts, key=lambda one: one.fitted.cost)]
-        if len(starts) == 1:
-            return starts[0]
-        tried = [self._descended(start, frame, FEW_STEPS) for start in starts]
-        return max(tried, key=lambda one: one.log_evidence)
+        return [self._account(each, self.fit.likely, frame)] if len(each) else []
 
     def _challenged(self, belief: Belief, before: Account, frame: Frame) -> Belief:
         """What explains a frame that the known contacts do not: the best of all starts."""
-        left = self._without(before, frame)
         starts = [belief.account, self._with_missing(belief.account, frame, far=True)]
-        starts += self._pressed_harder(before, frame)
         if before.family.count > 1 and _is_light(before):
             # A large contact that comes lightly is first taken for several.
             one = as_one(before.contacts)[None]
             starts.append(self._account(one, before.fitted.log_ratio, frame))
-        if left is not before:
-            starts.append(self._with_missing(left, frame, far=True))
-        for each in self._proposed(frame):
-            starts.append(self._account(each, self.fit.likely, frame))
-        best = self._best(starts, frame)
+        starts += self._proposed(frame) or self._grown_anew(frame)
+        tried = [self._descended(start, frame, FEW_STEPS) for start in starts]
+        best = max(tried, key=lambda one: one.log_evidence)
         begun = self._begun(best, frame, "warm start")
         return replace(begun, challenged=best.chi_squared)
 
-    def _pressed_harder(self, account: Account, frame: Frame) -> list[Account]:
-        """The same contacts, none of them below the graded sheet's onset, if any was.
-
-        Down there that sheet answers to nothing, so that no fit finds the way up.
-        """
-        each = account.contacts.copy()
-        light = account.family.light(account.fitted.parameters)
-        each[light, PEAK] = self.field.typical_peak
-        return [self._account(each, account.fitted.log_ratio, frame)] if light.any() else []
+    def _grown_anew(self, frame: Frame) -> list[Account]:
+        """Contacts found one after the other from none, where any are, while much is left."""
+        account, grown = self._nothing(frame), []
+        while self._explains_little(account, frame) and not frame.budget.over:
+            more = self._with_missing(account, frame, far=True)
+            if more is account:
+                break
+            account, grown = more, [more]
+        return grown
 
     def _lifted(self, account: Account, frame: Frame) -> Account:
         """Light contacts pressed as hard as the graded sheet says at its onset, where it does.
@@ -357,21 +334,6 @@ class Search:
         """What a start leads to, where that is likelier than the account; else this."""
         other = self._descended(start, frame, STEPS)
         return other if other.log_evidence > account.log_evidence else account
-
-    def _without(self, account: Account, frame: Frame) -> Account:
-        """The contacts that explain most: one after the other is left out while that helps."""
-        while account.family.count > 0:
-            rests = [
-                self._fitted(
-                    np.delete(account.contacts, k, axis=0), account.fitted.log_ratio, frame
-                )
-                for k in range(account.family.count)
-            ]
-            best = min(rests, key=lambda one: one.cost)
-            if best.cost >= account.fitted.cost:
-                break
-            account = account_of(self.fit, best, frame)
-        return account
 
     def _begun(self, account: Account, frame: Frame, how: str) -> Belief:
         nobody: tuple[Rivals, ...] = ({},) * account.family.count
@@ -532,10 +494,7 @@ class Search:
             (k, kind), *more = choice.items()
             before = belief.rivals[k][kind]
             if (gain if more else before.mean(gain)) >= LIKELIER:
-                explained = frame.likelihood.explains(changed.account.chi_squared)
-                born = None if explained else self._missed(belief, frame)
-                others = [born] if born else []
-                return max([changed, *others], key=lambda one: one.account.log_evidence)
+                return changed
             if not more:
                 own = np.arange(k, k + 1 + changed.account.family.count - account.family.count)
                 found = at_end(self.fit, changed.account, frame, own)
@@ -546,14 +505,6 @@ class Search:
     @staticmethod
     def _with_rivals(belief: Belief, k: int, mine: Rivals) -> Belief:
         return replace(belief, rivals=(*belief.rivals[:k], mine, *belief.rivals[k + 1 :]))
-
-    def _missed(self, belief: Belief, frame: Frame) -> Belief | None:
-        """The belief with a contact more, where that is likelier than data left unexplained."""
-        account = belief.account
-        if belief.lacks_none or frame.likelihood.explains(account.chi_squared):
-            return None
-        born = self._with_missing(account, frame, far=False)
-        return None if born is account else self._grown(belief, born)
 
     def _changed(self, belief: Belief, choice: Mapping[int, Kind], frame: Frame) -> Belief:
         """The belief with some contacts of another kind, fitted altogether."""

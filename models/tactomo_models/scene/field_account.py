@@ -383,8 +383,8 @@ class FieldAccountant:
                 np.hypot(sigma(by_area), OUTLINE_ERROR * of_mesh * areas.areas_m2),
             ]
         )
-        known["areas"] = replace(areas, sigmas=sigmas)
         if Channel.MAGNITUDE not in measured or not isinstance(self._graded, GradedResponse):
+            known["areas"] = replace(areas, sigmas=sigmas)
             return known
         size, slope = self._felt(pressure)
         known["magnitudes"] = (weight @ (share * size)) / area
@@ -411,12 +411,17 @@ class FieldAccountant:
         peak_sigma = np.hypot(peak_slope * sigma(by_peak), by_outline * peak_size)
         sides = np.stack([peak_sigma, peak_sigma])
         total_sigma, by_bend = np.hypot(sigma(weight @ by_force), total * by_edge), np.zeros(count)
+        mean_sigma = np.hypot(sigma(by_mean_kpa), by_outline_kpa * means / peaks)
         if isinstance(family, PressureField):
-            of_peaks, of_forces = self._along_bends(family, each, covariance)
+            of_peaks, spreads = self._along_bends(family, each, covariance)
+            of_mean, of_area, of_force = spreads[:, owner]
             sides = np.maximum(sides, of_peaks[:, owner])
+            mean_sigma = np.maximum(mean_sigma, means * of_mean)
+            sigmas[:, 2] = np.maximum(sigmas[:, 2], areas.areas_m2 * of_area)
             if not isinstance(measured, SheetsAndCompanions):  # else the force itself is told
-                more = (total * of_forces[owner]) ** 2 - total_sigma**2
+                more = (total * of_force) ** 2 - total_sigma**2
                 by_bend = np.sqrt(np.maximum(more, 0.0))
+        known["areas"] = replace(areas, sigmas=sigmas)
         known["contacts"] = FieldContacts(
             peak_magnitude=peak_size,
             peak_magnitude_sigma=peak_sigma,
@@ -425,7 +430,7 @@ class FieldAccountant:
             felt_sigma=peak_slope * sigma(by_peak),
             peak_kpa=peaks,
             mean_kpa=means,
-            mean_sigma_kpa=np.hypot(sigma(by_mean_kpa), by_outline_kpa * means / peaks),
+            mean_sigma_kpa=mean_sigma,
             force_n=1e3 * total * scale,
             force_sigma_n=1e3 * scale * np.hypot(total_sigma, by_bend),
             edge=edges,
@@ -444,8 +449,13 @@ class FieldAccountant:
     def _along_bends(
         self, family: PressureField, each: FloatArray, covariance: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """How far (2, K) magnitudes under peaks may be off, in `ONE_SIDED_95`, and (K,) forces."""
-        graded, sides, forces = self._graded, np.zeros((2, len(each))), np.zeros(len(each))
+        """How far peaks and sizes, and what follows of them, may be off along their bends.
+
+        Returns:
+            sides: (2, K) magnitudes under peaks, downwards and upwards, in `ONE_SIDED_95`.
+            spreads: (3, K) mean pressures, areas and forces, root mean squares over these.
+        """
+        graded, sides, spreads = self._graded, np.zeros((2, len(each))), np.zeros((3, len(each)))
         assert isinstance(graded, GradedResponse)
 
         lowest, highest = family.limits[:, PEAK]
@@ -462,16 +472,16 @@ class FieldAccountant:
                 family.prior_precision[index],
                 family.limits[:, SIZE],
             )
-            bend = along_bend(known, table)
+            bend = at_edge = along_bend(known, table)
             at, least, most = self._felt(family.unit_kpa * np.append(contact[PEAK], bend.peaks))[0]
             sides[:, k] = np.array([at - least, most - at]) / ONE_SIDED_95
             edge = family.index[k, EDGE]
-            if edge >= 0:  # a peak and an edge that rise together leave the force as it is
+            if edge >= 0:  # a peak and an edge that rise together leave mean and force as they are
                 along = covariance[index, edge]
-                at_edge = known.covariance - np.outer(along, along) / covariance[edge, edge]
-                bend = along_bend(replace(known, covariance=at_edge), table)
-            forces[k] = bend.force_spread
-        return sides, forces
+                fixed = known.covariance - np.outer(along, along) / covariance[edge, edge]
+                at_edge = along_bend(replace(known, covariance=fixed), table)
+            spreads[:, k] = at_edge.peak_spread, bend.area_spread, at_edge.force_spread
+        return sides, spreads
 
     def _felt(self, pressure_kpa: FloatArray) -> tuple[FloatArray, FloatArray]:
         """|Relative change| of the graded sheet and its slope; below its onset, the slope there."""

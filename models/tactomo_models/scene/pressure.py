@@ -123,6 +123,15 @@ class PressureCurve:
         """Standard uncertainty in kPa that a magnitude's own one makes, same shape."""
         return np.asarray(self._beyond(magnitude + sigma) - self._beyond(magnitude - sigma)) / 2
 
+    def skewed_spread(self, magnitude: FloatArray, down: FloatArray, up: FloatArray) -> FloatArray:
+        """The same of one that differs downwards and upwards: from the mode of a split normal.
+
+        Source: Wallis, "The two-piece normal", Statistical Science 29 (2014), section 2.
+        """
+        at = self._beyond(magnitude)
+        less, more = at - self._beyond(magnitude - down), self._beyond(magnitude + up) - at
+        return np.asarray(np.sqrt(less**2 - less * more + more**2))
+
     def sigma(self, magnitude: FloatArray) -> FloatArray:
         """Standard uncertainty of the curve in kPa, any shape."""
         return np.asarray(np.interp(magnitude, self.magnitude, self.sigma_kpa))
@@ -245,8 +254,8 @@ def pressures_of(
     above = np.array([r is PressureRange.ABOVE for r in ranges], bool)
     peak = curve.pressure(highest)
     spread, own = curve.spread(highest, highest_sigma), curve.sigma(highest)
-    peak_sigma = np.hypot(spread, own)
-    least = mean_least = curve.least(highest, down)
+    peak_sigma = np.hypot(np.maximum(spread, curve.skewed_spread(highest, down, up)), own)
+    least = curve.least(highest, down)
     if field is not None:
         # The curve in force may be another than the description's table, as after a calibration.
         by_curve = peak / np.maximum(field.peak_kpa, 1e-12)
@@ -254,7 +263,6 @@ def pressures_of(
         force_sigma = np.hypot(field.force_sigma_n * by_curve, force * own / peak)
         kpa = np.minimum(field.mean_kpa * by_curve, peak)  # but for rounding it is
         sigma = np.hypot(field.mean_sigma_kpa * by_curve, own)
-        mean_least = np.minimum(least, np.maximum(kpa - ONE_SIDED_95 * sigma, 0.0))
     else:
         kpa, sigma, force = peak, peak_sigma, 1e3 * peak * areas_m2
         by_area = magnitude * area_sigmas_m2 / areas_m2
@@ -274,7 +282,7 @@ def pressures_of(
         return np.where(known, value, np.where(above, bound, np.nan))
 
     return Pressures(
-        kpa=told(kpa, mean_least),
+        kpa=told(kpa, least * kpa / np.maximum(peak, 1e-12)),
         sigma_kpa=told(sigma, nothing),
         force_n=told(force, at_least, is_force),
         force_sigma_n=told(force_sigma, nothing, is_force),

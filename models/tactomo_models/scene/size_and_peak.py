@@ -51,7 +51,10 @@ class Bend:
     """What peaks and sizes along the bend come to."""
 
     peaks: FloatArray  # (2,) that the true one exceeds, and stays below, with 95 %
-    force_spread: float  # root mean square of the force's relative distance from the likeliest
+    # Root mean squares of relative distances from the likeliest: of the peak, the area, the force.
+    peak_spread: float
+    area_spread: float
+    force_spread: float
 
 
 def along_bend(known: SizeAndPeak, table: ReflectionTable) -> Bend:
@@ -79,5 +82,6 @@ def along_bend(known: SizeAndPeak, table: ReflectionTable) -> Bend:
     share /= share.sum()
     order = np.argsort(peaks, axis=None)
     bounds = np.interp([0.05, 0.95], share.flat[order].cumsum(), peaks.flat[order])
-    off = peaks / peak * np.exp(2 * away) - 1
-    return Bend(np.asarray(bounds), float(np.sqrt((share * off**2).sum())))
+    times, area = peaks / peak, np.exp(2 * away)
+    spreads = [float(np.sqrt((share * (x - 1) ** 2).sum())) for x in (times, area, times * area)]
+    return Bend(np.asarray(bounds), *spreads)

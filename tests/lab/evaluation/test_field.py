@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 from tactomo_lab.evaluation.field import STILL_ROWS, cases_of_row, frames_of_row
 from tactomo_lab.evaluation.moving import draw_sequence
 from tactomo_lab.evaluation.play import play
 from tactomo_lab.evaluation.regimes import make_case
-from tactomo_lab.scenes.case import Case
+from tactomo_lab.scenes.case import Case, as_described, measure, simulate
+from tactomo_lab.scenes.drawing import seed_of
 from tactomo_lab.scenes.measures import summarise
 from tactomo_models import SensorDescription
+from tactomo_models.scene.press import Press
 from tactomo_protocol import Channel
 
 
@@ -39,6 +44,26 @@ def test_a_small_ball_in_a_crowd_is_not_surely_flat(paper: SensorDescription) ->
     (outcome,) = play([make_case(paper, "crowded-soft", "tuning", 3)], "auto")
     assert outcome.score.count_right
     assert not any(contact.surely_wrong for contact in outcome.score.contacts)
+
+
+@pytest.mark.slow
+def test_a_scene_that_is_replaced_at_once_is_found_without_a_network(
+    paper: SensorDescription,
+) -> None:
+    """Begun at contacts of before that still explain something, one contact or four were told."""
+    rectangle = partial(Press, shape="rectangle")
+    ring, ball = partial(Press, shape="ring"), partial(Press, profile="dome")
+    scenes = [
+        [Press(-0.015, -0.049, 200, 0.0095), rectangle(-0.006, -0.010, 193, 0.0134, 0.0083, 3.05)],
+        [ring(0.021, -0.047, 213, 0.0158, 0.0151, 0.35), ball(0.041, 0.012, 158, 0.0088)],
+        [ring(-0.025, 0.048, 104, 0.0110)],
+        [ball(0.021, 0.002, 125, 0.0169, 0.0092, 1.09), ring(0.019, -0.040, 117, 0.0116)],
+    ]
+    plan = replace(as_described(paper, *scenes), snr_db=60.0, snr_of="voltage")
+    seeds = [seed_of("tuning", what, 0) for what in ("replaced", "noise of replaced")]
+    case = measure(simulate(paper, plan, seeds[0]), "tuning", 0, seeds[1])
+    found = [outcome.score.found for outcome in play([case], "fit")]
+    assert found == [2, 2, 1, 2]
 
 
 @pytest.mark.slow

@@ -155,6 +155,16 @@ def test_a_bound_holds_in_95_of_100(truth: float, *, is_upper: bool) -> None:
     assert held.mean() == pytest.approx(0.95, abs=0.01)
 
 
+def test_a_peak_that_may_be_far_higher_is_as_uncertain() -> None:
+    """Against the second moment of a split normal from its mode, by its density."""
+    at, down, up = np.array([0.1]), np.array([0.005]), np.array([0.02])
+    off = np.linspace(-6 * down[0], 6 * up[0], 100_001)
+    density = np.exp(-0.5 * (off / np.where(off < 0, down, up)) ** 2)
+    expected = np.sqrt((density * off**2).sum() / density.sum()) * 60 / 0.18  # kPa of each change
+    assert CURVE.skewed_spread(at, down, up) == pytest.approx(expected, rel=1e-3)
+    assert CURVE.skewed_spread(at, down, down) == pytest.approx(CURVE.spread(at, down))
+
+
 def test_near_the_top_a_contact_stays_above_until_it_is_clearly_not() -> None:
     ranges = [
         [CURVE.range_of(magnitude, 0.01, last) for magnitude in (0.176, 0.18, 0.185)]
