@@ -35,9 +35,11 @@ def test_every_message_carries_the_envelope_and_a_scan_its_volts(bench: Start) -
         if kind == "status":  # the last one is said again to whoever joins
             sequence = list(dict.fromkeys(sequence))
         assert sequence == list(range(sequence[0], sequence[0] + len(sequence)))
-    counter = b.skin.scan()
+    volts = {"magnitude": 1.1 * REST, "structure": 0.9 * REST}
+    counter = b.skin.scan(volts=volts)
     scan = b.listener.wait("scan", lambda s: s["scan_counter"] == counter)
-    assert array_from_wire(scan["magnitude"]) == pytest.approx(REST, abs=2e-5)
+    for channel, sent in volts.items():
+        assert array_from_wire(scan[channel]) == pytest.approx(sent, abs=2e-5)
     assert (scan["tier"], scan["misfit"]) == (None, None)
 
 
