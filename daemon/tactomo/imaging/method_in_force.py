@@ -126,7 +126,8 @@ class ProcessorShare:
         now_s: float,  # monotonic seconds
     ) -> bool:
         """Take note of a frame in which something presses; return whether `of_work` has changed."""
-        if now_s - self._noted_s > LOOK_S:  # what was left out while nothing pressed
+        # What was left out while nothing pressed; not while this frame waited for the processor.
+        if now_s - wall_s - self._noted_s > LOOK_S:
             self._dropped, self._frames, self._looked_s = dropped, 0, now_s
         self._noted_s = now_s
         self._frames += 1

@@ -148,7 +148,7 @@ def test_busy_skins_degrade_and_starve_no_still_one(
     try:
         robot.play("still", still(rest), 20.0)
         for name in busy:
-            robot.play(name, moving(pressed(load_description("paper_square"))), 50.0)
+            robot.play(name, moving(pressed(load_description("paper_square"))), 100.0)
         before = robot.status("still")
         for name in busy:
             robot.wait(name, lambda status: "processor_shared" in status["events"]["counts"])

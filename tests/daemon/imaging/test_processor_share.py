@@ -30,6 +30,14 @@ def test_time_is_halved_while_others_take_the_processor_and_scans_are_left_out()
     assert Computer().run(0.4, 10.0, drops=True) == [1 / 2, 1 / 4, LEAST]
 
 
+def test_time_is_halved_where_one_frame_waits_for_seconds() -> None:
+    share, given = ProcessorShare(), []
+    for frame in range(1, 7):
+        if share.note(0.05, 1.5, 70 * frame, 1.5 * frame):
+            given.append(share.of_work)
+    assert given == [1 / 2, 1 / 4, LEAST]
+
+
 def test_a_busy_processor_alone_takes_no_time_nor_do_lost_scans_alone() -> None:
     assert Computer().run(0.4, 10.0, drops=False) == []
     assert Computer().run(0.95, 10.0, drops=True) == []
