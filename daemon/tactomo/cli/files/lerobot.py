@@ -7,23 +7,24 @@ docs/lerobot.md has the format of a robot's log.
 
 from __future__ import annotations
 
+import csv
+import io
 import itertools
 import logging
 import math
+from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from tactomo_client.touch import CONTACT_COLUMNS, Touch
-from tactomo_models.array_files import NUMBERS, read_text
 from tactomo_models.arrays import FloatArray
 from tactomo_models.foreign_file import open_regular
 
 from tactomo.cli.files.recorded_frames import Gaps, TimedFrame
-from tactomo.errors import TactomoError, needs, os_errors_as
+from tactomo.errors import TactomoError, needs
 
 CLOCKS: Final = ("monotonic_s", "realtime_s")
 ACTION: Final = "action."
@@ -67,35 +68,49 @@ class RobotLog:
 
 
 def read_robot_log(path: Path) -> RobotLog:
-    """Read a robot's log; raise TactomoError or DataError, which name the line that is wrong."""
-    step = "give a CSV file with a line of names"
-    with os_errors_as(TactomoError, f"cannot read {path}", step), open_regular(path) as file:
-        line = file.readline(MAX_LINE).decode("utf-8-sig", "replace")
-    names = [name.strip(' "\r\n') for name in line.split(",")]
-    clock = next((name for name in CLOCKS if name in names), None)
-    if clock is None or len(set(names)) < len(names):
+    """Read a robot's log; raise TactomoError, which names the line that is wrong."""
+    numbers = array("d")
+    try:
+        with open_regular(path) as binary, io.TextIOWrapper(binary, "utf-8", newline="") as file:
+            lines = csv.reader(iter(lambda: file.readline(MAX_LINE), ""), strict=True)
+            names = [name.strip() for name in next(lines, [])]
+            for number, line in enumerate(lines, 2):
+                numbers.extend(_numbers(path, number, names, line))
+    except (OSError, csv.Error, UnicodeDecodeError) as error:
         raise TactomoError(
-            f"{path} has no column {' or '.join(CLOCKS)}, or one name twice",
+            f"cannot read {path}: {getattr(error, 'strerror', None) or error}",
+            "give a CSV file with a line of names",
+        ) from error
+    clock = next((name for name in CLOCKS if name in names), None)
+    if clock is None or len(set(names)) < len(names) or not numbers:
+        raise TactomoError(
+            f"{path} has no column {' or '.join(CLOCKS)}, one name twice, or no steps",
             "write time.monotonic() or time.time() of each of the robot's steps into it",
         )
-    rows = read_text(path)[NUMBERS]
-    if rows.shape[1] != len(names) or np.iscomplexobj(rows):
-        raise TactomoError(f"{path}: its lines are not {len(names)} numbers, one a name", step)
+    rows = np.frombuffer(numbers).reshape(-1, len(names))
     times_s = rows[:, names.index(clock)]
     episodes = rows[:, names.index(EPISODE)] if EPISODE in names else np.zeros(len(rows))
-    odd = np.flatnonzero(~np.isfinite(rows).all(axis=1))
-    _refuse(path, odd, "a value is not a finite number", "correct it")
-    step = "give the steps in the order of their times; monotonic_s never jumps"
-    back = np.flatnonzero(np.diff(times_s) <= 0) + 1
-    _refuse(path, back, f"{clock} is not later than in the line before", step)
+    back = np.flatnonzero(np.diff(times_s) <= 0)
+    if len(back):
+        raise TactomoError(
+            f"{path}, line {back[0] + 3}: {clock} is not later than in the line before",
+            "give the steps in the order of their times; monotonic_s never jumps",
+        )
     rest = [i for i, name in enumerate(names) if name not in (*CLOCKS, EPISODE)]
     return RobotLog(clock, times_s, episodes, tuple(names[i] for i in rest), rows[:, rest])
 
 
-def _refuse(path: Path, rows: NDArray[np.intp], cause: str, step: str) -> None:
-    """Raise TactomoError for the first of these rows, if any; the line of names is line 1."""
-    if len(rows):
-        raise TactomoError(f"{path}, line {rows[0] + 2}: {cause}", step)
+def _numbers(path: Path, number: int, names: list[str], line: list[str]) -> list[float]:
+    try:
+        found = [float(cell) for cell in line]
+    except ValueError:
+        found = []
+    if len(found) != len(names) or not all(math.isfinite(each) for each in found):
+        raise TactomoError(
+            f"{path}, line {number}: not {len(names)} numbers, one for each name",
+            "mend or remove that line",
+        )
+    return found
 
 
 DEFAULT_FPS: Final = 30  # as LeRobot's own programs have it
