@@ -138,8 +138,7 @@ class _Session:
         log: Path,
     ) -> None:
         self._view, self._console, self._log = view, console, log
-        self._given_mm2 = area_mm2
-        self._area_mm2 = math.nan  # of the indenter: what was given, or is asked for first
+        self._area_mm2 = area_mm2 or math.nan  # of the indenter; asked for first where unknown
         self._suggested = suggestions_kpa(status)
         self.readings: list[Reading] = _read_log(log)
 
@@ -162,10 +161,9 @@ class _Session:
             "newtons. undo drops\nthe last reading, done or Ctrl-C ends. Each "
             "reading is kept at once."
         )
-        if self._given_mm2 is None:
+        if math.isnan(self._area_mm2):
             diameter_mm = self._asked("Diameter of the indenter in mm: ", least=1.0, most=1e3)
-            self._given_mm2 = math.pi / 4 * diameter_mm**2
-        self._area_mm2 = self._given_mm2
+            self._area_mm2 = math.pi / 4 * diameter_mm**2
         if self.readings:
             kept = f"{len(self.readings)} readings in {self._log}"
             say(f"Going on with {kept}; delete the file to begin anew.")
