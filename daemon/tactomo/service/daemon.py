@@ -73,7 +73,7 @@ from tactomo.imaging.kept_reference import KeptReference, reference_path
 from tactomo.imaging.pipeline import Pipeline
 from tactomo.protocols import find_protocol, protocol_named
 from tactomo.recordings.recorder import Recorder
-from tactomo.recordings.recording import Origin
+from tactomo.recordings.recording import REPLAY_SCHEME, Origin
 from tactomo.recordings.recording_writer import Entry
 from tactomo.recordings.records import calibration_text
 from tactomo.recordings.replay import Replay, read_replay, without_calibrations
@@ -129,9 +129,10 @@ class Daemon:
             if config.description not in shipped_descriptions():
                 self._description_file = Path(config.description).resolve()
         if len(config.ports) > len(description.channels):
-            raise ConfigError(
-                f"{description.name} has one channel, and two ports are given", "give one port"
-            )
+            of, step = "two ports are given", "give one port"
+            if any(url.startswith(f"{REPLAY_SCHEME}:") for url in config.ports):
+                of, step = "the recording is of two", "give another --description"
+            raise ConfigError(f"{description.name} has one channel, and {of}", step)
         self._description = description
         self._methods = tuple(dict.fromkeys((*available_methods(), config.method)))
         why = left_out(self._methods, description)

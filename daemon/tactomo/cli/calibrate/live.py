@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from tactomo_client import Frame, Status
 from tactomo_client.recording import open_recording
-from tactomo_models import CalibrationError, load_description
+from tactomo_models import CalibrationError, SensorDescription, load_description
 from tactomo_models.calibration import load_cell
 from tactomo_models.calibration.calibration_file import (
     SUFFIX,
@@ -39,6 +39,7 @@ from tactomo_models.calibration.curve import (
 from tactomo_models.calibration.outliers import find_outliers
 from tactomo_models.foreign_file import open_regular
 from tactomo_models.scans.plausibility import DISTRUST
+from tactomo_models.scene.pressure import described_curve
 
 from tactomo.cli.console import Console
 from tactomo.cli.files.recorded_frames import recorded_frames
@@ -53,6 +54,7 @@ MIN_FRAMES: Final = 5
 STILL_MM: Final = 1.0
 STILL_SHARE: Final = 0.03
 """Of the magnitude, by which it may change from the first half to the second."""
+OTHER_UNIT: Final = 4.0  # times the described pressures: psi for kPa are 1/7, N/cm² 1/10
 SHARES: Final = (-0.3, -0.05, 0.1, 0.25, 0.4, 0.6, 0.8, 1.0)
 """Of the way from the onset to the top, that are suggested going up; and down again."""
 
@@ -364,17 +366,34 @@ def fitted(
     cell = load_cell.read_load_cell(readings, area_mm2)
     if recording is None:
         _need(cell, readings, "magnitude")
-        subject = subject_of(sensor, load_description(description or DEFAULT_DESCRIPTION))
-        joined = load_cell.direct_readings(cell)
+        known = load_description(description or DEFAULT_DESCRIPTION)
+        subject, joined = subject_of(sensor, known), load_cell.direct_readings(cell)
     else:
         _need(cell, readings, "time")
-        subject, joined = _with_recording(sensor, cell, recording, offset_s, description)
+        known, subject, joined = _with_recording(sensor, cell, recording, offset_s, description)
     if device_ids:
         subject = subject.model_copy(update={"device_ids": device_ids})
     odd = _odd_lines(joined)
-    for note in (*joined.notes, *(f"{line} disagrees with the others" for line in odd)):
+    disagree = (f"{line} disagrees with the others" for line in odd)
+    for note in (*joined.notes, *_doubt_of_unit(joined, known), *disagree):
         say(note, err=True)
     return PressureCalibration.of_readings(subject, joined.readings), odd
+
+
+def _doubt_of_unit(joined: load_cell.Joined, description: SensorDescription) -> list[str]:
+    """Say where pressures are so far from the description's that they may be of another unit."""
+    curve = described_curve(description)
+    assert curve is not None
+    low, high = curve.magnitude[[0, -1]]
+    read = [each for each in joined.readings if low < each.magnitude < high]
+    shares = [each.pressure_kpa / float(curve.pressure(np.array(each.magnitude))) for each in read]
+    share = statistics.median(shares) if shares else 1.0
+    if 1 / OTHER_UNIT < share < OTHER_UNIT:
+        return []
+    return [
+        f"pressures are {share:.2g} times those of {description.name}'s table at the same "
+        "magnitudes: is the column pressure_kpa in kPa, or force_n in N?"
+    ]
 
 
 def _odd_lines(joined: load_cell.Joined) -> list[str]:
@@ -399,7 +418,7 @@ def _need(cell: load_cell.LoadCell, path: Path, what: str) -> None:
 
 def _with_recording(
     sensor: str, cell: load_cell.LoadCell, path: Path, offset_s: float, description: str | None
-) -> tuple[Subject, load_cell.Joined]:
+) -> tuple[SensorDescription, Subject, load_cell.Joined]:
     recorded = open_recording(path).sensor
     if recorded and recorded != sensor:
         raise CalibrationError(
@@ -420,7 +439,8 @@ def _with_recording(
                 for m in moments
             ]
         )
-    return subject, load_cell.joined_readings(replace(cell, times_s=cell.times_s + offset_s), seen)
+    joined = load_cell.joined_readings(replace(cell, times_s=cell.times_s + offset_s), seen)
+    return frames.description, subject, joined
 
 
 def _devices_in(path: Path) -> tuple[str, ...]:

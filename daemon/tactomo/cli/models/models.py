@@ -128,11 +128,13 @@ def import_model(
     from tactomo_models.imported.mesh import read_model
     from tactomo_models.imported.model import describe, evenly_placed
 
-    read_step = "give a .dxf, .svg, .mat or .npz file"
-    is_drawing = source.suffix.lower() in (".dxf", ".svg")
+    read_step, suffix = "give a .dxf, .svg, .mat or .npz file", source.suffix.lower()
+    if suffix not in (".dxf", ".svg", ".mat", ".npz"):
+        raise TactomoError(f"{source} is of no kind that is read", read_step)
+    is_drawing = suffix in (".dxf", ".svg")
     with (
         os_errors_as(TactomoError, f"cannot read {source}", read_step),
-        needs(f"{source.suffix[1:].upper()}", "pip install 'tactomo[drawings]'"),
+        needs(suffix[1:].upper(), "pip install 'tactomo[drawings]'"),
     ):
         model = (
             read_drawing(source, electrodes, outline, unit_mm)
