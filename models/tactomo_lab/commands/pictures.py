@@ -5,19 +5,15 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from tactomo.cli.plot.plot import save_figure
+from tactomo_models import SensorDescription
 
-from tactomo_lab.scenes.measures import mean
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-    from tactomo_models import SensorDescription
-
-    from tactomo_lab.evaluation.play import Outcome
-    from tactomo_lab.scenes.measures import Score
+from tactomo_lab.evaluation.play import Outcome
+from tactomo_lab.scenes.measures import Score, mean
 
 ROWS = 4  # scenes of each kind
 CHANGE = "|Δσ|/σ₀"

@@ -9,11 +9,11 @@ alarm.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import count as count_from
 from itertools import islice
 from math import ceil
-from typing import Final
+from typing import Any, Final
 
 from tactomo_models.sensor.description import SensorDescription
 
@@ -21,7 +21,6 @@ from tactomo_lab.evaluation.drifting import draw_day
 from tactomo_lab.evaluation.moving import (
     COMING,
     NOISE_DB,
-    NoiseOf,
     draw_sequence,
     mixed_sequence,
     palm_sequence,
@@ -111,15 +110,17 @@ def cases_of_row(
     numbers = range(ceil(count / SCENES_A_SEQUENCE))
 
     def still(shapes: tuple[SceneShape, ...], snr_db: float) -> Iterator[Case]:
-        return islice(_still(description, seed_set, shapes, snr_db), count)
-
-    def mixed(noise_of: NoiseOf) -> Iterator[Case]:
-        return (mixed_sequence(description, seed_set, number, noise_of) for number in numbers)
-
-    def days(is_followed: bool) -> Iterator[Case]:
-        return (
-            draw_day(description, seed_set, number, is_followed=is_followed) for number in numbers
+        """Scenes of some shapes, of one to `MAX_CONTACTS` contacts in turns."""
+        drawn = (
+            (draw_still(description, seed_set, contacts, number), number)
+            for number in count_from()
+            for contacts in range(1, MAX_CONTACTS + 1)
         )
+        fitting = islice((each for each in drawn if each[0].shape in shapes), count)
+        return (still_case(description, plan, seed_set, n, snr_db) for plan, n in fitting)
+
+    def lasting(draw: Callable[..., Case], **options: Any) -> Iterator[Case]:
+        return (draw(description, seed_set, number, **options) for number in numbers)
 
     if row == "ordinary":
         return {f"{row} {snr_db:g} dB": still(SCENE_SHAPES, snr_db) for snr_db in ORDINARY_DB}
@@ -128,23 +129,10 @@ def cases_of_row(
     if row == "palm":
         return {row: (palm_sequence(description, seed_set, number) for number in range(count))}
     if row == DAYS:
-        return {f"{row}, reference follows": days(True), f"{row}, one tare": days(False)}
+        kinds = {"reference follows": True, "one tare": False}
+        return {f"{row}, {kind}": lasting(draw_day, is_followed=k) for kind, k in kinds.items()}
     if row == "moving":
-        return {row: (draw_sequence(description, seed_set, number) for number in numbers)}
+        return {row: lasting(draw_sequence)}
     if row == "mixed-moving":
-        return {f"{row}, noise of {noise_of}": mixed(noise_of) for noise_of in NOISE_DB}
+        return {f"{row}, noise of {of}": lasting(mixed_sequence, noise_of=of) for of in NOISE_DB}
     return {row: (make_case(description, row, seed_set, number) for number in range(count))}
-
-
-def _still(
-    description: SensorDescription,
-    seed_set: SeedSet,
-    shapes: tuple[SceneShape, ...],
-    snr_db: float,
-) -> Iterator[Case]:
-    """Scenes of some shapes, of one to `MAX_CONTACTS` contacts in turns."""
-    for number in count_from():
-        for contacts in range(1, MAX_CONTACTS + 1):
-            plan = draw_still(description, seed_set, contacts, number)
-            if plan.shape in shapes:
-                yield still_case(description, plan, seed_set, number, snr_db)

@@ -332,17 +332,16 @@ def palm_sequence(description: SensorDescription, seed_set: SeedSet, number: int
     """
     plan = draw_plan(description, "palm", seed_set, number)
     simulated = simulate(description, plan, seed_of(seed_set, "stability palm sheet", number))
-    steps = [_palm_step(presses) for presses in plan.frames]
+    steps = []
+    for presses in plan.frames:
+        is_there = any(press.pressure_kpa >= PALM_KPA[0] for press in presses)
+        named = dict(zip(INDENTERS, presses, strict=False))
+        steps.append(Step("palm" if is_there else COMING, named))
     rng = np.random.default_rng(seed_of(seed_set, "palm seconds", number))
     period_s = float(np.exp(rng.uniform(*np.log(PALM_S)))) / PALM_FRAMES
     noise = noise_stds(simulated.volts, plan.snr_db, plan.snr_of)
     seed = seed_of(seed_set, "palm noise", number)
     return follow(simulated, steps, noise, np.random.default_rng(seed), seed_set, number, period_s)
-
-
-def _palm_step(presses: tuple[Press, ...]) -> Step:
-    is_there = any(press.pressure_kpa >= PALM_KPA[0] for press in presses)
-    return Step("palm" if is_there else COMING, dict(zip(INDENTERS, presses, strict=False)))
 
 
 def mixed_steps(draw: Draw) -> list[Step]:

@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, lru_cache, partial
+from functools import cache, cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -182,13 +182,8 @@ def simulate(description: SensorDescription, plan: Plan, skin: np.random.SeedSeq
     if true.structure is not None:
         true = with_contrast(true, plan.contrast)
     what = f"{SIMULATION} {plan!r} {skin.entropy} {true.model_dump_json()}"
-    volts = _kept(what, lambda: _simulate(plan, true, _fine_mesh(description), skin))
+    volts = _kept(what, lambda: _simulate(plan, true, fine_mesh(description), skin))
     return Simulated(plan, told, true, volts)
-
-
-@lru_cache(maxsize=1)
-def _fine_mesh(description: SensorDescription) -> SheetMesh:
-    return fine_mesh(description)
 
 
 def _simulate(

@@ -10,6 +10,7 @@ paper's; on another sensor they scale with its shorter side and with its own tab
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -100,9 +101,7 @@ def draw_scene(description: SensorDescription, seed: int, number: int) -> Traini
     half_axis_m = ROBUST_HALF_AXIS_M if count < CROWD else CROWDED_HALF_AXIS_M
     soft = bool(rng.random() < SOFT)
 
-    def press() -> Press:
-        return _any_press(description, rng, half_axis_m, soft=soft)
-
+    press = partial(_any_press, description, rng, half_axis_m, soft=soft)
     presses = placed_apart(description, count, gap, press)
     off_m = np.stack([one_off, other_off])
     return TrainingScene(presses, draw_contrast(rng), opposite, (one, other), off_m)

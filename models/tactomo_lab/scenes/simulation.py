@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import skfem
@@ -47,6 +48,7 @@ REACH_SHARE = 0.30  # of the electrodes' distance: neighbours do not pull at eac
 CELL_SAMPLES = 5  # per side of a map cell, where the truth's coverage is averaged
 
 
+@lru_cache(maxsize=1)
 def fine_mesh(description: SensorDescription) -> SheetMesh:
     """Mesh that scenes of a sensor are simulated on; made once, it serves them all."""
     spacing_m = SPACING_SHARE * description.spacing_m

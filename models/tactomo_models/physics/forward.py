@@ -56,6 +56,7 @@ class ForwardModel(CompiledSheet):
     Attributes:
         bare_voltages: (M,) of the unpressed sheet, in scan order; see `volts_per_unit`.
         at_rest: (P,) conductivity of the unpressed sheet at the pressable nodes.
+        triangle_areas_m2: (t,) area of each triangle that pressing changes.
     """
 
     def __init__(self, description: SensorDescription, bare: BareSheet) -> None:
@@ -76,7 +77,7 @@ class ForwardModel(CompiledSheet):
             "closed": self._closed,
             "gradient": self._gradient,
             "stiffness": self._stiffness,
-            "area": self._area,
+            "area": self.triangle_areas_m2,
             "conductivity": self._bare_conductivity,
             "at_rest": self.at_rest,
             "potentials": bare.potentials,
@@ -117,11 +118,11 @@ class ForwardModel(CompiledSheet):
         touched = np.flatnonzero(np.isin(bare.triangles, bare.pressable).any(axis=0))
         corners = bare.triangles[:, touched]  # (3, t)
         stretch = None if bare.stretch is None else bare.stretch[touched]
-        gradient, self._area = hat_gradients(bare.points[:, corners], stretch)
+        gradient, self.triangle_areas_m2 = hat_gradients(bare.points[:, corners], stretch)
         self._corner_support = positions(bare.support, nodes)[corners].T  # (t, 3)
         self._corner_pressable = positions(bare.pressable, nodes)[corners].T  # -1 elsewhere
         self._gradient = np.ascontiguousarray(gradient.transpose(2, 0, 1))  # (t, 2, 3)
-        self._stiffness = stiffnesses(gradient, self._area)
+        self._stiffness = stiffnesses(gradient, self.triangle_areas_m2)
         uneven = np.ones(nodes) if bare.conductivity is None else bare.conductivity
         self.at_rest = uneven[bare.pressable]
         # Conductivity of a triangle is the mean of its corners'.
@@ -129,7 +130,7 @@ class ForwardModel(CompiledSheet):
 
     def _index_nodes(self) -> None:
         """Triangles around each pressable node; neighbours of each support node."""
-        triangles, nodes = len(self._area), len(self.bare.support)
+        triangles, nodes = len(self.triangle_areas_m2), len(self.bare.support)
         triangle, corner = np.nonzero(self._corner_pressable >= 0)
         node = self._corner_pressable[triangle, corner]
         self._triangles_of = _lists(node, triangle, len(self.bare.pressable), fill=triangles)
@@ -152,14 +153,11 @@ class ForwardModel(CompiledSheet):
         return self._corner_pressable[whole], self._stiffness[whole]
 
     @property
-    def triangle_areas_m2(self) -> FloatArray:
-        """(t,) area of each triangle that pressing changes."""
-        return self._area
-
-    @property
     def node_areas_m2(self) -> FloatArray:
         """(P,) share of the sheet's area that belongs to each pressable node."""
-        return np.asarray(np.append(self._area, 0.0)[self._triangles_of].sum(axis=1) / 3)
+        return np.asarray(
+            np.append(self.triangle_areas_m2, 0.0)[self._triangles_of].sum(axis=1) / 3
+        )
 
     def newtons_per_kpa(self, region_m: Ring | None = None) -> FloatArray:
         """Newtons (P,) on a region, or on the whole sheet, of 1 kPa at each pressable node."""

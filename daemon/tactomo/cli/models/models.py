@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from tactomo.cli.commands import Group
@@ -295,8 +296,6 @@ def _electrodes_in_words(description: SensorDescription) -> str:
 
 def _draw_sheet(axes: Axes, description: SensorDescription, paper_mm: float) -> None:
     """The sheet in millimetres; `paper_mm` is what one of them on paper stands for."""
-    import numpy as np
-
     half_x, half_y = 5e2 * description.width_m, 5e2 * description.height_m
     frame_m = description.sheet.frame_width_m
     _draw_outline(axes, description, 0.0, facecolor="0.88", edgecolor="black")
@@ -323,8 +322,6 @@ def _draw_outline(axes: Axes, description: SensorDescription, inset_m: float, **
 
 def _draw_pairs(axes: Axes, description: SensorDescription, paper_mm: float) -> None:
     """The first drive pair and the pairs that are measured meanwhile, inside the rim or on pads."""
-    import numpy as np
-
     inwards = np.isnan(description.pad_radii_m)[:, None] * -outwards(description)
     inside = 1e3 * description.electrode_centres_m + 3 * paper_mm * inwards
     pairs = description.pairs
@@ -352,8 +349,6 @@ def _draw_pairs(axes: Axes, description: SensorDescription, paper_mm: float) -> 
 def _draw_map(
     axes: Axes, description: SensorDescription, image: Any, label: str, colours: str
 ) -> None:
-    import numpy as np
-
     x, y = 1e3 * description.map_x_m, 1e3 * description.map_y_m
     shown = axes.pcolormesh(x, y, image, cmap=colours, shading="nearest")
     axes.plot(*1e3 * description.electrode_centres_m.T, "ks", markersize=3, clip_on=False)

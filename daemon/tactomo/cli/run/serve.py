@@ -191,7 +191,7 @@ def zenoh(
     from tactomo.log import configure_logging
     from tactomo.stream.zenoh_bridge import serve
 
-    configure_logging("info")
+    configure_logging()
     if bind:
         serve(ZenohProxy(_checked(robot) if robot else "*", _endpoint(bind), config))
     else:
