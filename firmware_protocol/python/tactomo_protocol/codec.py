@@ -59,7 +59,7 @@ _MAX_BODY = _MAX_PAYLOAD - _PREFIX.size - _CRC_BYTES
 _MAX_ENCODED = cobs.max_encoded_length(_MAX_PAYLOAD)
 MAX_FRAME_BYTES = _MAX_ENCODED + 2
 
-_U8, _U16, _U32 = 2**8 - 1, 2**16 - 1, 2**32 - 1
+_U8, _U32 = 2**8 - 1, 2**32 - 1
 
 
 class FieldError(ValueError):

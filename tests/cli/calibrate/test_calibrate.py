@@ -76,6 +76,14 @@ def test_a_slip_in_a_table_is_named_by_its_line(
     assert made.stderr.count("disagrees") == 1
 
 
+def test_pressures_that_may_be_of_another_unit_are_told(tactomo: Run, tmp_path: Path) -> None:
+    psi = "".join(f"{kpa / 6.895:.3f},{magnitude:.4f}\n" for kpa, magnitude in ROWS)
+    for table, is_doubted in ((CSV, False), (f"pressure_kpa,magnitude\n{psi}", True)):
+        (tmp_path / "log.csv").write_text(table)
+        made = tactomo(*FIT, "--dry-run", status=0)
+        assert ("is the column pressure_kpa in kPa" in made.stderr) == is_doubted
+
+
 @pytest.mark.slow
 def test_a_table_with_a_slip_is_kept_on_request_alone(tactomo: Run, tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text(CSV + "220,2.0\n")

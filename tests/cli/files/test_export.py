@@ -19,6 +19,8 @@ from mcap_protobuf.decoder import DecoderFactory
 from mcap_ros2.decoder import DecoderFactory as Ros2DecoderFactory
 from recorded_grasp import FRAMES, PERIOD_NS, SENSOR, START_NS, contacts_of, write_grasp
 from small_sensor import SMALL
+from tactomo.recordings.recording import Origin
+from tactomo.recordings.recording_writer import RecordingWriter
 from tactomo_models import Press, SkinSimulator, load_description
 from tactomo_protocol import Channel
 from waiting import wait_until
@@ -172,6 +174,16 @@ def test_what_is_there_is_written_over_only_if_one_says_so(tactomo: Run, grasp: 
         assert grasp.with_name(name).read_text() == "precious"
         tactomo(*arguments, "--force", status=0)
         assert grasp.with_name(name).read_text() != "precious"
+
+
+def test_a_recording_of_two_ports_is_none_of_a_sensor_of_one_channel(
+    tactomo: Run, tmp_path: Path
+) -> None:
+    origin = Origin("left", "paper_square", "", ("/dev/magnitude", "/dev/structure"), "0.1")
+    RecordingWriter(tmp_path / "two.mcap", origin).close()
+    result = tactomo("export", "two.mcap", "out.csv", "-d", "graded_square", status=1)
+    assert "graded_square has one channel, and the recording is of two" in result.stderr
+    assert "give another --description" in result.stderr
 
 
 def bare_recording(tactomo: Run, tmp_path: Path, scans_pressed: int) -> Path:
