@@ -89,10 +89,7 @@ def write_arrays(path: Path, arrays: dict[str, Any]) -> None:
     write_whole(path, lambda file: np.savez_compressed(file, **arrays))
 
 
-def write_whole(
-    path: Path,  # the file
-    write: Callable[[IO[bytes]], object],  # writes its content
-) -> None:
+def write_whole(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     """Write a file and make its folder; a half-written one is never left under that name.
 
     A link is followed. What is no file, such as /dev/null, is written to and not replaced.

@@ -271,16 +271,8 @@ def follow(
         kept = {name: scan for name, scan in scans.items() if name not in step.lost}
         time_s = index * (period_s or 0.0)
         frames.append(Frame(step.presses, kept, step.phase, anew, time_s, step.countable))
-    return Case(
-        seed_set,
-        number,
-        simulated.plan,
-        simulated.told,
-        simulated.true,
-        first,
-        frames,
-        is_followed=period_s is not None,
-    )
+    about = simulated.plan, simulated.told, simulated.true
+    return Case(seed_set, number, *about, first, frames, is_followed=period_s is not None)
 
 
 # ------------------------------------------------------------------ mixed presses, and a palm

@@ -312,15 +312,8 @@ def measure(
         )
         for index, presses in enumerate(plan.frames)
     ]
-    return Case(
-        seed_set,
-        number,
-        plan,
-        simulated.told,
-        simulated.true,
-        Reference.from_scans(*map(rest.get, Channel)),
-        frames,
-    )
+    tare = Reference.from_scans(*map(rest.get, Channel))
+    return Case(seed_set, number, plan, simulated.told, simulated.true, tare, frames)
 
 
 def with_lead(

@@ -52,11 +52,7 @@ class Tank:
 class TankFit:
     """Finds what stands in tanks that are read one way."""
 
-    def __init__(
-        self,
-        model: TankModel,  # the tank
-        readings: Readings,  # that there are
-    ) -> None:
+    def __init__(self, model: TankModel, readings: Readings) -> None:
         self._model, self._readings = model, readings
         self.images = LinearImages(model, readings)
         structure = model.description.structure

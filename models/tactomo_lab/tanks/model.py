@@ -178,11 +178,7 @@ def signed_image(likely: FloatArray) -> RegularGridInterpolator:
 class LinearImages:
     """What the network is shown of one way to read a tank."""
 
-    def __init__(
-        self,
-        model: TankModel,  # the tank
-        readings: Readings,  # that there are
-    ) -> None:
+    def __init__(self, model: TankModel, readings: Readings) -> None:
         x, y, self.inside = pixel_grid(PIXELS)
         width = LENGTH / np.sqrt(2)  # whose square's autocorrelation has that length
         step = SPACING * width

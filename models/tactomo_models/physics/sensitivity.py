@@ -30,10 +30,7 @@ class Visibility:
     place_m: FloatArray
 
 
-def find_visibility(
-    description: SensorDescription,  # the sensor
-    artifact: Artifact,  # what was built for it
-) -> Visibility:
+def find_visibility(description: SensorDescription, artifact: Artifact) -> Visibility:
     """Return how well a round press is seen at every map node.
 
     It changes the conductivity by a tenth; its radius is a tenth of the sheet's shorter side.

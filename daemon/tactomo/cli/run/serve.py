@@ -77,14 +77,7 @@ def foxglove(
     if layout is not None:
         write_layout(layout, sensors[0])
     stop = stop_asked()
-    with Bridge(
-        sensors,
-        address,
-        host,
-        foxglove_port,
-        as_keys(keys),
-        allow_origin or (),
-    ) as bridge:
+    with Bridge(sensors, address, host, foxglove_port, as_keys(keys), allow_origin or ()) as bridge:
         _print_addresses(bridge, layout, announce)
         bridge.run(stop)
 
