@@ -132,12 +132,9 @@ def reciprocity_found(examined: Examination) -> Finding:
     """How far voltages differ that are the same on any sheet."""
     i, j = examined.wiring.reciprocal.T
     if len(i) == 0:
-        return Finding(
-            "reciprocity",
-            Level.UNKNOWN,
-            "the pattern has no reciprocal pairs: no voltage is read twice",
-            "no fault; drive and measure by the same offset to have this check",
-        )
+        detail = "the pattern has no reciprocal pairs: no voltage is read twice"
+        step = "no fault; drive and measure by the same offset to have this check"
+        return Finding("reciprocity", Level.UNKNOWN, detail, step)
     difference = np.abs(examined.mean[i] - examined.mean[j])
     size = np.maximum((np.abs(examined.mean[i]) + np.abs(examined.mean[j])) / 2, TINY)
     each, together = float(np.mean(difference / size)), float(difference.sum() / size.sum())
@@ -155,13 +152,9 @@ def reciprocity_found(examined: Examination) -> Finding:
         )
     elif beyond > GOOD_RECIPROCITY:
         level, step = Level.FAULT, "mend the electrodes that are named; else compare the gains"
-    return Finding(
-        "reciprocity",
-        level,
-        f"error {each:.1%} (mean of pairs), {together:.1%} of all voltages together",
-        step,
-        {"pairs_percent": 1e2 * each, "together_percent": 1e2 * together},
-    )
+    detail = f"error {each:.1%} (mean of pairs), {together:.1%} of all voltages together"
+    figures = {"pairs_percent": 1e2 * each, "together_percent": 1e2 * together}
+    return Finding("reciprocity", level, detail, step, figures)
 
 
 _ELECTRODE_WORDS = {
@@ -178,30 +171,24 @@ def electrodes_found(examined: Examination) -> Iterator[Finding]:
     if not bad:
         yield Finding("electrodes", Level.OK, f"all {len(states)} read as they should")
         return
-    many = len(bad) > BROKEN_SHARE * len(states)
+    level, at_once = Level.FAULT, ""
+    if len(bad) > BROKEN_SHARE * len(states):
+        level = Level.BROKEN
+        at_once = "so many at once are rather the multiplexer, the ground or the order of the pairs"
     for state, (what, step) in _ELECTRODE_WORDS.items():
         named = [n for n in bad if states[n] == state]
         if named:
             numbers = ", ".join(map(str, named))
             subject = f"electrodes {numbers}: each" if len(named) > 1 else f"electrode {numbers}"
+            figures = {"electrodes": named}
             yield Finding(
-                f"{state}_electrodes",
-                Level.BROKEN if many else Level.FAULT,
-                f"{subject} {what}",
-                "so many at once are rather the multiplexer, the ground or the order of the pairs"
-                if many
-                else step,
-                {"electrodes": named},
+                f"{state}_electrodes", level, f"{subject} {what}", at_once or step, figures
             )
     if examined.order.exchanged:
         pairs = " and ".join(f"{a} with {b}" for a, b in examined.order.exchanged)
-        yield Finding(
-            "swapped_electrodes",
-            Level.FAULT,
-            f"leads changed places: {pairs}",
-            "exchange the plugs, then tare",
-            {"electrodes": sorted(itertools.chain(*examined.order.exchanged))},
-        )
+        detail, step = f"leads changed places: {pairs}", "exchange the plugs, then tare"
+        figures = {"electrodes": sorted(itertools.chain(*examined.order.exchanged))}
+        yield Finding("swapped_electrodes", Level.FAULT, detail, step, figures)
 
 
 def model_found(examined: Examination, is_of_sheet: bool | None, is_moved: bool) -> Finding:

@@ -365,26 +365,16 @@ def stream_findings(evidence: Evidence) -> list[Finding]:
 
 def _packets_found(heard: Heard) -> Finding:
     total = heard.packets + heard.corrupt + heard.faulty
-    counts = {"packets": heard.packets, "corrupt": heard.corrupt, "faulty": heard.faulty}
-    figures = {name: float(count) for name, count in counts.items()}
+    share = heard.corrupt / max(total, 1)
+    level, words, step = Level.OK, f"{heard.packets}, none damaged", ""
     if heard.faulty > heard.corrupt:
-        return Finding(
-            "packets",
-            Level.FAULT,
-            f"{heard.faulty} of {total} are intact and break the protocol",
-            FIRMWARE_STEP,
-            {**figures},
-        )
-    if not heard.corrupt:
-        return Finding("packets", Level.OK, f"{heard.packets}, none damaged", "", {**figures})
-    share = heard.corrupt / total
-    return Finding(
-        "packets",
-        Level.FAULT if share > CORRUPT_NOTED else Level.ADVICE,
-        f"{heard.corrupt} of {total} came damaged ({share:.2%})",
-        CABLE_STEP,
-        {**figures},
-    )
+        words = f"{heard.faulty} of {total} are intact and break the protocol"
+        level, step = Level.FAULT, FIRMWARE_STEP
+    elif heard.corrupt:
+        words = f"{heard.corrupt} of {total} came damaged ({share:.2%})"
+        level, step = Level.FAULT if share > CORRUPT_NOTED else Level.ADVICE, CABLE_STEP
+    counts = {"packets": heard.packets, "corrupt": heard.corrupt, "faulty": heard.faulty}
+    return Finding("packets", level, words, step, {k: float(n) for k, n in counts.items()})
 
 
 def _lost_found(evidence: Evidence, lost: int) -> Finding:
@@ -397,25 +387,17 @@ def _lost_found(evidence: Evidence, lost: int) -> Finding:
     is_busy = evidence.left_out > DROPPED_NOTED * count
     share = lost / (count + lost)
     is_fault = share > (LATE_SHARE if is_busy else DROPPED_NOTED) and lost >= FEWEST_INCOMPLETE
-    return Finding(
-        "lost_scans",
-        Level.FAULT if is_fault else Level.ADVICE,
-        f"{lost} of {count + lost} dual scans ({share:.1%}) did not arrive",
-        "the computer is busy: repeat when the computer is idle"
-        if is_busy
-        else "is the line too slow for the rate, or the computer too busy?",
-        figures,
-    )
+    words = f"{lost} of {count + lost} dual scans ({share:.1%}) did not arrive"
+    step = "is the line too slow for the rate, or the computer too busy?"
+    if is_busy:
+        step = "the computer is busy: repeat when the computer is idle"
+    return Finding("lost_scans", Level.FAULT if is_fault else Level.ADVICE, words, step, figures)
 
 
 def _pressed_found(evidence: Evidence) -> Finding:
     figures: dict[str, Any] = {"frames": float(evidence.frames), "pressed": float(evidence.pressed)}
     if not evidence.pressed:
         return Finding("frames", Level.OK, f"{evidence.frames}, nothing pressed", "", figures)
-    return Finding(
-        "frames",
-        Level.ADVICE,
-        f"something presses in {evidence.pressed} of {evidence.frames} frames",
-        "leave the skin alone while it is examined; if nothing touches it, run `tactomo tare`",
-        figures,
-    )
+    words = f"something presses in {evidence.pressed} of {evidence.frames} frames"
+    step = "leave the skin alone while it is examined; if nothing touches it, run `tactomo tare`"
+    return Finding("frames", Level.ADVICE, words, step, figures)

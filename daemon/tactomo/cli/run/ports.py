@@ -157,16 +157,12 @@ def _row(
     path: str, adapter: Adapter | None, others: list[Adapter], has_modem_manager: bool, root: Path
 ) -> Row:
     use = lasting_name(adapter, others) if adapter else ""
-    remarks = list(_access(path))
+    remarks = []
+    if os.path.exists(path) and not os.access(path, os.R_OK | os.W_OK):
+        remarks.append(f"you may not open it; {how_to_grant(path)}")
     if adapter is not None:
         remarks += _remarks(adapter, others, use, has_modem_manager)
     return Row(path, adapter, use, other_holders(path, root), remarks)
-
-
-def _access(path: str) -> list[str]:
-    if not os.path.exists(path) or os.access(path, os.R_OK | os.W_OK):
-        return []
-    return [f"you may not open it; {how_to_grant(path)}"]
 
 
 def _remarks(

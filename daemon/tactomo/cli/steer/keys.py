@@ -70,7 +70,7 @@ def make(
     force: Force = False,
 ) -> None:
     """Make a pair of keys, and print the next steps."""
-    where = (_folder(folder)).absolute()
+    where = (folder or default_folder()).absolute()
     make_pair(where, name, is_server=server, force=force)
     secret, public = secret_path(where, name), public_path(where, name)
     say(f"{secret}   stays on this computer, mode 0600")
@@ -112,7 +112,7 @@ def allow(
 
     A running daemon applies the change at once.
     """
-    where = _folder(folder)
+    where = folder or default_folder()
     client = put_on_list(where, public, server, may_command=may_command, force=force)
     say(f"{client.name} ({client.public}) {_rights(client)} of {server}, in {where}")
 
@@ -127,7 +127,7 @@ def revoke(
 
     All other clients of the daemon reconnect by themselves at that moment.
     """
-    where = _folder(folder)
+    where = folder or default_folder()
     take_off_list(where, name, server)
     say(f"{name} is off the list of {server}, in {where}")
 
@@ -135,7 +135,7 @@ def revoke(
 @app.command("list", epilog=examples("tactomo keys list"))
 def list_(folder: Folder = None) -> None:
     """List the keys made here, and for each server the allowed clients."""
-    where = _folder(folder)
+    where = folder or default_folder()
     pairs, servers = list_pairs(where), list_servers(where)
     if not pairs and not servers:
         say(f"there are no keys in {where}; make some with `tactomo keys make NAME`")
@@ -147,10 +147,6 @@ def list_(folder: Folder = None) -> None:
         say(f"\nclients of {name}:")
         for client in list_clients(where, name):
             say(f"  {client.name}   {client.public}   {_rights(client)}")
-
-
-def _folder(given: Path | None) -> Path:
-    return given or default_folder()
 
 
 def _rights(client: Client) -> str:
