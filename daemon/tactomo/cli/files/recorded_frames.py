@@ -153,16 +153,8 @@ def recorded_frames(
             )
             assert known is not None
             remade = _reconstructed(given, known, Path(folder))
-        yield RecordedFrames(
-            path,
-            given.sensor,
-            known,
-            given.start_ns,
-            start_s,
-            float("inf") if end_s is None else end_s,
-            given,
-            remade,
-        )
+        window = start_s, float("inf") if end_s is None else end_s
+        yield RecordedFrames(path, given.sensor, known, given.start_ns, *window, given, remade)
 
 
 def _reconstructed(given: Recording, known: SensorDescription, folder: Path) -> list[Recording]:

@@ -148,19 +148,15 @@ def _without_contacts(frame: Frame) -> str:
 
 
 def _screen(view: View, columns: int, rows: int) -> RenderableType:
-    frame = view.frame
+    frame, title = view.frame, Text(f"tactomo watch {view.sensor}")
     if frame is None:
-        return Panel(_state_line(view), title=Text(f"tactomo watch {view.sensor}"))
+        return Panel(_state_line(view), title=title)
     description = view.status.fields.get("description") or {} if view.status else {}
     image = map_text(frame, description, max(10, min(columns - 44, 2 * (rows - 6))))
     body = Table.grid(padding=(0, 2))
     body.add_row(image, Group(_contact_table(frame, view.is_stale), Text(), _health(view, frame)))
-    panel = Panel(
-        body,
-        title=Text(f"tactomo watch {view.sensor}"),
-        subtitle="Ctrl-C ends",
-        border_style="red" if view.is_gone or view.is_stale else "none",
-    )
+    border = "red" if view.is_gone or view.is_stale else "none"
+    panel = Panel(body, title=title, subtitle="Ctrl-C ends", border_style=border)
     return Group(_state_line(view), panel)
 
 
