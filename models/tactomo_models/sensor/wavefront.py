@@ -18,6 +18,9 @@ MAX_TRIANGLES: Final = 10_000
 LARGEST: Final = 1e6  # of a coordinate: a kilometre in millimetres; beyond, products overflow
 ON_EDGE: Final = 1e-6
 """In barycentric coordinates: what is nearer to an edge is on either side of it."""
+ROUND: Final = float(np.cos(np.radians(15)))
+"""Cosine of the largest angle from a triangle's own normal to its corner's mean, up to which the
+triangles there stand for a round surface; beyond, they meet in a fold and each is flat."""
 
 
 @dataclass(frozen=True)
@@ -174,8 +177,12 @@ def _triangles(points: FloatArray, of_points: IntArray, sheet: FloatArray, name:
     for corner in range(3):
         np.add.at(at_points, of_points[:, corner], outward)
     lengths = np.linalg.norm(at_points, axis=1, keepdims=True)
-    normals = np.divide(at_points, lengths, out=np.zeros_like(points), where=lengths > 0)
-    return Triangles(corners, sheet, normals[of_points])
+    normals = np.divide(at_points, lengths, out=np.zeros_like(points), where=lengths > 0)[of_points]
+    own = (outward / np.linalg.norm(outward, axis=1, keepdims=True))[:, None]
+    least = np.ones(len(points))
+    np.minimum.at(least, of_points, (normals * own).sum(axis=2))
+    is_round = least[of_points][..., None] >= ROUND
+    return Triangles(corners, sheet, np.where(is_round, normals, own))
 
 
 class _NoTextureError(Exception):

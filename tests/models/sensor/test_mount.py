@@ -115,6 +115,18 @@ def test_a_surface_of_triangles_is_the_cylinder_that_it_stands_for(tmp_path: Pat
     assert np.abs(normals - true_normals).max() < 0.02
 
 
+def test_the_faces_of_a_fold_stay_flat(tmp_path: Path) -> None:
+    """Two plates that meet at 35 degrees along the sheet's y, each of one rectangle."""
+    out, up = np.cos(np.radians(35)), np.sin(np.radians(35))
+    rows = [(x, y) for y in (-0.03, 0.03) for x in (-0.04, 0.0, 0.04)]
+    corners = "".join(
+        f"v {x if x < 0 else out * x} {y} {max(0.0, up * x)}\nvt {x} {y}\n" for x, y in rows
+    )
+    mount = mounted(tmp_path, "surface", obj=corners + "f 1/1 2/2 5/5 4/4\nf 2/2 3/3 6/6 5/5\n")
+    _, normals = mount.place(np.array([[-0.02, 0.01], [-0.001, 0.0], [0.001, 0.0]]))
+    assert normals == pytest.approx(np.array([[0, 0, 1], [0, 0, 1], [-up, 0, out]]))
+
+
 def test_a_recording_carries_the_surface(tmp_path: Path) -> None:
     mounted(tmp_path, "surface")
     description = load_description(tmp_path / "small.toml")
