@@ -191,8 +191,16 @@ def companions_of(
     """Return the readings (T,) of the companions that a file has, and their means at rest.
 
     Raises:
-        DataError: readings are not as many as frames.
+        DataError: readings are not as many as frames, or of a companion that is not described.
     """
+    keys = [f"companion_{name}" for name in description.companion]
+    known = {*keys, *(f"{key}_reference" for key in keys)}
+    unknown = [key for key in arrays if key.startswith("companion_") and key not in known]
+    if known and unknown:
+        raise DataError(
+            f"{source}: the sensor description has no companion for {', '.join(unknown)}; rename "
+            f"or leave out: its companions are {', '.join(description.companion)}"
+        )
     readings, at_rest = {}, {}
     for name in description.companion:
         key = f"companion_{name}"

@@ -99,6 +99,10 @@ def test_companions_of_a_file_are_judged_in_every_layout(
         names = [Flag(int(flags)).names() for flags in maps["flags"]]
         assert names == [[], ["companion_missing"], ["companion_disputed"]]
         assert maps["force_n"][0] == pytest.approx(force_n, rel=0.02)
+    arrays["companion_cel"] = arrays.pop("companion_cell")
+    np.savez(tmp_path / "in.npz", **arrays)
+    refused = tactomo("reconstruct", "in.npz", "out.npz", "-d", "cell.toml", status=1)
+    assert "no companion for companion_cel; rename" in refused.stderr
 
 
 @pytest.mark.slow
