@@ -45,6 +45,9 @@ SHIFTED_SHARE: Final = 0.25  # likewise, of the skin's size; counted from a corn
 LEARNT_RATIO: Final = 0.5
 """Of the error that the middle of all places makes: what locates no better has learnt nothing.
 With shuffled places it is 1.0, of 100 presses on the worst of five measured skins 0.2."""
+OTHER_UNIT: Final = 5.0
+"""Times the physics' force, from which a known force seems to be in grams (102), kilograms (0.10)
+or another unit; a cover that takes a quarter of the load makes it 1.3."""
 
 Progress = Callable[[int, int], None]
 
@@ -321,7 +324,14 @@ def _judged_forces(
     taught, physics = error_of(found_n), error_of(by_physics_n)
     alike = error_of(np.full(len(known), np.median(force_n)))
     if taught < min(physics, LEARNT_RATIO * alike):
-        return taught, []
+        times = force_n[np.isfinite(by_physics_n)] / by_physics_n[np.isfinite(by_physics_n)]
+        ratio = float(np.median(times)) if len(times) else 1.0
+        if 1 / OTHER_UNIT < ratio < OTHER_UNIT:
+            return taught, []
+        return np.nan, [
+            f"forces are not learnt: they are {ratio:.2g} times those of the physics (median); "
+            "give newtons, or correct the description's response"
+        ]
     others = "" if np.isinf(physics) else f"by the physics alone {physics:.0%}, "
     return np.nan, [
         f"forces are not learnt: held-out ones are {taught:.0%} off (median) as taught, {others}"

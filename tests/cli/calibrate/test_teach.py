@@ -90,6 +90,7 @@ def test_forces_that_say_nothing_are_not_learnt(tactomo: Run, tmp_path: Path, go
         (shuffled, r"held-out ones are \d+% off"),
         (few, "5 are known .* 20 are needed"),
         (np.full(60, 9.81), "held-out .* 0% if all were alike"),
+        (good["force_n"] * 1000 / 9.81, "they are 1.*; give newtons"),
     ):
         made = teach(tactomo, tmp_path, changed(good, force_n=force_n))
         assert re.search(f"forces are not learnt: {why}", made.stderr)
