@@ -5,7 +5,7 @@ What is kept from frame to frame is which contact is which, and in which range i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Final
 
@@ -38,17 +38,26 @@ class FrameMaker:
         self._finder = finder
         self._tracker = ContactTracker()
         self._ranges: dict[int, tuple[PressureRange, float]] = {}  # and magnitude, of each identity
+        self._felt: set[str] = set()  # companions that felt something in the last quiet frame
 
     def forget(self) -> None:
         """Forget which contacts were which."""
         self._tracker.clear()
+        self._felt = set()
 
     def quiet(self, measurement: Measurement) -> Reconstruction:
-        """Return the frame of a measurement without a change: all contacts have gone."""
-        self._tracker.update(np.zeros((0, 2)), np.zeros(0))
-        return self.nothing(measurement, "no change above the noise")
+        """Return the frame of a measurement without a change: all contacts have gone.
 
-    def nothing(self, measurement: Measurement, reason: str) -> Reconstruction:
+        A companion that feels something twice in a row contradicts the sheets; once, its noise may.
+        """
+        self._tracker.update(np.zeros((0, 2)), np.zeros(0))
+        felt = {k for k, one in measurement.companions.items() if not one.agrees_with(0.0)}
+        disputed, self._felt = felt & self._felt, felt
+        return self.nothing(measurement, "no change above the noise", disputed)
+
+    def nothing(
+        self, measurement: Measurement, reason: str, disputed: Collection[str] = ()
+    ) -> Reconstruction:
         """Return a frame in which nothing presses, as far as the measurement can tell."""
         changes, flags, misfit = measurement.changes, measurement.flags, float("nan")
         if changes:
@@ -61,6 +70,12 @@ class FrameMaker:
             tells = Channel.STRUCTURE if Channel.STRUCTURE in changes else Channel.MAGNITUDE
             if changes[tells].hides:
                 flags |= Flag.NOISE_HIGH
+        if disputed:
+            flags |= Flag.COMPANION_DISPUTED
+        felt = [
+            f"companion {name} reads {measurement.companions[name].force_n:.3g} N"
+            for name in sorted(disputed)
+        ]
         blank = self._description.shown(
             np.zeros((self._description.map.nodes_y, self._description.map.nodes_x))
         )
@@ -71,12 +86,12 @@ class FrameMaker:
             structure=blank if Channel.STRUCTURE in changes else None,
             contacts=(),
             tier="quiet",
-            reason="; ".join([reason, *measurement.faults]),
+            reason="; ".join([reason, *felt, *measurement.faults]),
             misfit=misfit,
             flags=flags,
             stage_s=measurement.stage_s,
             force_n=0.0 if changes else float("nan"),
-            companions=_judged(measurement, {}),
+            companions=_judged(measurement, dict.fromkeys(disputed, False)),
         )
 
     def frame(

@@ -105,6 +105,21 @@ def test_a_load_cell_that_contradicts_the_sheet_is_named_and_left_out(
     assert not again.flags & Flag.COMPANION_DISPUTED  # it is believed once it agrees
 
 
+def test_a_load_cell_that_feels_a_force_on_a_bare_sheet_is_named(
+    reconstructor: Reconstructor, skin: Skin
+) -> None:
+    """A cell that hangs went unnamed, and was believed when the next press let go."""
+    reconstructor.reset()
+    bare, stuck = skin.scan()["magnitude"], [("load_cell", BALL_N / 2 + 5)]
+    once, twice = (reconstructor.reconstruct(bare, None, companions=stuck) for _ in range(2))
+    assert Flag.COMPANION_DISPUTED not in once.flags  # a single reading may be noise
+    assert Flag.COMPANION_DISPUTED in twice.flags
+    assert f"companion load_cell reads {BALL_N:.3g} N" in twice.reason
+    assert (twice.companions["load_cell"].state, twice.force_n) == ("disputed", 0.0)
+    free = reconstructor.reconstruct(bare, None, companions=[("load_cell", 5.0)])
+    assert not free.flags
+
+
 @pytest.mark.parametrize("factor", [pytest.param(0.5, marks=pytest.mark.slow), 2.0])
 def test_a_load_cell_that_is_wrong_costs_a_moving_scene_nothing(
     sensor: SensorDescription, skin: Skin, monkeypatch: pytest.MonkeyPatch, factor: float
@@ -176,7 +191,7 @@ def test_a_reading_from_before_the_sheets_moved_tells_nothing(
         assert Flag.COMPANION_MISSING not in measurement.flags
         frame_of_it = reconstructor.solve(measurement)
         found.append(frame_of_it.companions["load_cell"].state)
-    assert found[:4] == ["late", "late", "unused", "unused"]  # nothing presses
+    assert found[:4] == ["late", "late", "unused", "disputed"]  # nothing presses
     assert found[4:6] == ["late", "late"]
     assert not {"late", "unused"} & set(found[6:])
 
