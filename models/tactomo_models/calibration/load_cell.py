@@ -27,6 +27,7 @@ MAX_BYTES: Final = 16 << 20  # an hour of lines at 1 kHz
 WINDOW_S: Final = 0.5  # of a log: the load is to be still for so long
 MAX_NUMBER: Final = 1e12  # of any kind: seconds since 1970 are 2e9, and squares stay finite
 UNLOADED_KPA: Final = 1.0  # a load cell at rest
+DISAGREES: Final = 0.1  # of a pressure: more is no rounding of it, nor of an indenter's diameter
 CLOCKS: Final = ("time_s", "realtime_s")
 
 
@@ -83,6 +84,11 @@ def read_load_cell(
     table = _Table(path)
     clock = next((name for name in CLOCKS if name in table.columns), "")
     pressure = table.pressures_kpa(area_mm2)
+    if 0 < pressure.max(initial=0.0) <= UNLOADED_KPA:
+        raise CalibrationError(
+            f"{path}: the largest pressure is {pressure.max():g} kPa; is it in MPa, or the "
+            "indenter's area too large?"
+        )
     indenter_mm2 = table.areas_mm2(area_mm2)
     times_s = table.numbers(clock) if clock else table.unknown
     if clock and np.any(np.diff(times_s) < 0):
@@ -237,21 +243,37 @@ class _Table:
         return self.numbers(column, least) if column in self.columns else self.unknown
 
     def pressures_kpa(self, area_mm2: float | None) -> FloatArray:
+        areas_mm2 = self.areas_mm2(area_mm2)
         if "pressure_kpa" in self.columns:
-            return np.maximum(self.numbers("pressure_kpa"), 0.0)
+            told = np.maximum(self.numbers("pressure_kpa"), 0.0)
+            if "force_n" in self.columns and areas_mm2 is not None:
+                self._check_forces(told, areas_mm2)
+            return told
         if "force_n" not in self.columns:
             raise CalibrationError(
                 f"{self._path} has no column pressure_kpa, and no force_n; it has: "
                 f"{', '.join(self.columns)}"
             )
-        # A load cell at rest says a little less than nothing now and then.
-        areas_mm2 = self.areas_mm2(area_mm2)
         if areas_mm2 is None:
             raise CalibrationError(
                 f"{self._path} has forces and no area_mm2 or diameter_mm of the indenter; add a "
                 "column, or give --diameter-mm or --area-mm2"
             )
+        # A load cell at rest says a little less than nothing now and then.
         return np.maximum(1e3 * self.numbers("force_n") / areas_mm2, 0.0)
+
+    def _check_forces(self, told_kpa: FloatArray, areas_mm2: FloatArray) -> None:
+        """Refuse pressures that are not the forces over the indenter's area."""
+        loaded = told_kpa > UNLOADED_KPA
+        by_force_kpa = (1e3 * self.numbers("force_n") / areas_mm2)[loaded]
+        if not len(by_force_kpa):
+            return
+        ratio = float(np.median(by_force_kpa / told_kpa[loaded]))
+        if abs(ratio - 1) > DISAGREES:
+            raise CalibrationError(
+                f"{self._path}: force_n over the indenter's area is {ratio:.3g} times pressure_kpa; "
+                "correct the column that is wrong, or leave it out"
+            )
 
     def areas_mm2(self, area_mm2: float | None) -> FloatArray | None:
         """Area of the indenter at each line; None where nobody says."""

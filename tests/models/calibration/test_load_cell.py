@@ -59,6 +59,11 @@ def test_what_is_told_is_taken(log: Path) -> None:
         ("pressure_kpa,time_s\n100,2\n100,1\n", "line 3: time_s goes back"),
         ("pressure_kpa,magnitude,direction\n100,0.1,left\n", "is not up, down or unknown"),
         ("pressure_kpa,magnitude\n100,-0.1\n", "magnitude is below 0"),
+        ("pressure_kpa,magnitude\n0.06,0.1\n0.27,0.4\n", "is 0.27 kPa; is it in MPa"),
+        (
+            "pressure_kpa,force_n,area_mm2,magnitude\n100,700,707,0.1\n0,0,707,0\n",
+            "is 9.9 times pressure_kpa",
+        ),
     ],
 )
 def test_a_bad_log_is_refused_with_the_line(log: Path, text: str, said: str) -> None:
