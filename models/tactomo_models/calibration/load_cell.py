@@ -271,8 +271,8 @@ class _Table:
         ratio = float(np.median(by_force_kpa / told_kpa[loaded]))
         if abs(ratio - 1) > DISAGREES:
             raise CalibrationError(
-                f"{self._path}: force_n over the indenter's area is {ratio:.3g} times pressure_kpa; "
-                "correct the column that is wrong, or leave it out"
+                f"{self._path}: force_n over the indenter's area is {ratio:.3g} times "
+                "pressure_kpa; correct the column that is wrong, or leave it out"
             )
 
     def areas_mm2(self, area_mm2: float | None) -> FloatArray | None:

@@ -32,8 +32,8 @@ from tactomo_models.scene.pressure_field import PressureField
 # half, 6 % of mixed moving presses are surely wrong, with this none.
 MESH_ERROR = 0.1
 NEGLIGIBLE = 0.1  # of chi-squared, a third of a standard deviation: what a last step may leave
-# Of the square of a failed step's length, as the prior measures it: a longer step is the same again.
-# With 0.8 the solves are the same to 2 %.
+# Of the square of a failed step's length, as the prior measures it: a longer step is the same
+# again. With 0.8 the solves are the same to 2 %.
 SAME_STEP = 0.9
 
 Propose = Callable[[], FloatArray]  # (K, COLUMNS) contacts, see `pressure_field.ellipses_of`
