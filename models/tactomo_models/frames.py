@@ -5,7 +5,7 @@ What is kept from frame to frame is which contact is which, and in which range i
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
@@ -51,13 +51,23 @@ class FrameMaker:
         A companion that feels something twice in a row contradicts the sheets; once, its noise may.
         """
         self._tracker.update(np.zeros((0, 2)), np.zeros(0))
+        frame = self.nothing(measurement, "no change above the noise")
         felt = {k for k, one in measurement.companions.items() if not one.agrees_with(0.0)}
-        disputed, self._felt = felt & self._felt, felt
-        return self.nothing(measurement, "no change above the noise", disputed)
+        disputed, self._felt = sorted(felt & self._felt), felt
+        if not disputed:
+            return frame
+        said = (
+            f"companion {name} reads {measurement.companions[name].force_n:.3g} N"
+            for name in disputed
+        )
+        return replace(
+            frame,
+            flags=frame.flags | Flag.COMPANION_DISPUTED,
+            reason="; ".join([frame.reason, *said]),
+            companions=_judged(measurement, dict.fromkeys(disputed, False)),
+        )
 
-    def nothing(
-        self, measurement: Measurement, reason: str, disputed: Collection[str] = ()
-    ) -> Reconstruction:
+    def nothing(self, measurement: Measurement, reason: str) -> Reconstruction:
         """Return a frame in which nothing presses, as far as the measurement can tell."""
         changes, flags, misfit = measurement.changes, measurement.flags, float("nan")
         if changes:
@@ -70,12 +80,6 @@ class FrameMaker:
             tells = Channel.STRUCTURE if Channel.STRUCTURE in changes else Channel.MAGNITUDE
             if changes[tells].hides:
                 flags |= Flag.NOISE_HIGH
-        if disputed:
-            flags |= Flag.COMPANION_DISPUTED
-        felt = [
-            f"companion {name} reads {measurement.companions[name].force_n:.3g} N"
-            for name in sorted(disputed)
-        ]
         blank = self._description.shown(
             np.zeros((self._description.map.nodes_y, self._description.map.nodes_x))
         )
@@ -86,12 +90,12 @@ class FrameMaker:
             structure=blank if Channel.STRUCTURE in changes else None,
             contacts=(),
             tier="quiet",
-            reason="; ".join([reason, *felt, *measurement.faults]),
+            reason="; ".join([reason, *measurement.faults]),
             misfit=misfit,
             flags=flags,
             stage_s=measurement.stage_s,
             force_n=0.0 if changes else float("nan"),
-            companions=_judged(measurement, dict.fromkeys(disputed, False)),
+            companions=_judged(measurement, {}),
         )
 
     def frame(
@@ -104,6 +108,7 @@ class FrameMaker:
     ) -> Reconstruction:
         """Return the frame that a method's estimate makes, with its contacts and pressures."""
         has_magnitude = Channel.MAGNITUDE in measurement.changes
+        self._felt = set()
         with measurement.timed("contacts"):
             areas, size, sigma = self._areas_of(estimate)
             ids = self._tracker.update(areas.centres_m, areas.areas_m2)

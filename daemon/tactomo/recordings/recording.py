@@ -13,7 +13,7 @@ lies beyond damage in the middle is for `recovery`.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -245,6 +245,11 @@ class Recording:
         path = quote(str(self.path.resolve()))
         ports = range(len(self.origin.ports))
         return tuple(f"{REPLAY_SCHEME}://{path}?port={n}&speed={speed:g}" for n in ports)
+
+
+def is_replayed(urls: Iterable[str]) -> bool:
+    """Whether any of a daemon's ports replays a recording."""
+    return any(url.startswith(f"{REPLAY_SCHEME}:") for url in urls)
 
 
 def open_recording(path: str | Path) -> Recording:

@@ -26,7 +26,7 @@ from tactomo_models import Reference
 from tactomo_protocol import CompanionReading, Hello, Scan, encode
 
 from tactomo.errors import RecordingError
-from tactomo.recordings.recording import REPLAY_SCHEME, Origin
+from tactomo.recordings.recording import Origin, is_replayed
 from tactomo.recordings.records import DRIFT_ARRAYS, REFERENCE_ARRAYS
 from tactomo.scans import FrameRecord
 from tactomo.timing import wall_clock_ns
@@ -141,7 +141,7 @@ class RecordingWriter:
         self._writer = Writer(self._file)  # type: ignore[arg-type]
         self._chunk_begun_ns: int | None = None
         self._chunk_port_bytes = 0
-        is_replay = any(port.startswith(f"{REPLAY_SCHEME}:") for port in origin.ports)
+        is_replay = is_replayed(origin.ports)
         self._most_port_bytes = CHUNK_PORT_BYTES if is_replay else MAX_PENDING_BYTES
         try:
             self._begin(origin)

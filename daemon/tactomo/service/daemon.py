@@ -73,7 +73,7 @@ from tactomo.imaging.kept_reference import KeptReference, reference_path
 from tactomo.imaging.pipeline import Pipeline
 from tactomo.protocols import find_protocol, protocol_named
 from tactomo.recordings.recorder import Recorder
-from tactomo.recordings.recording import REPLAY_SCHEME, Origin
+from tactomo.recordings.recording import Origin, is_replayed
 from tactomo.recordings.recording_writer import Entry
 from tactomo.recordings.records import calibration_text
 from tactomo.recordings.replay import Replay, read_replay, without_calibrations
@@ -130,7 +130,7 @@ class Daemon:
                 self._description_file = Path(config.description).resolve()
         if len(config.ports) > len(description.channels):
             of, step = "two ports are given", "give one port"
-            if any(url.startswith(f"{REPLAY_SCHEME}:") for url in config.ports):
+            if is_replayed(config.ports):
                 of, step = "the recording is of two", "give another --description"
             raise ConfigError(f"{description.name} has one channel, and {of}", step)
         self._description = description

@@ -21,7 +21,7 @@ from tactomo.imaging.imaging import Imaging
 from tactomo.imaging.pipeline import Pipeline
 from tactomo.memory import resident_bytes
 from tactomo.recordings.recorder import Recorder
-from tactomo.recordings.recording import REPLAY_SCHEME
+from tactomo.recordings.recording import is_replayed
 from tactomo.recordings.replay import Playback
 from tactomo.service.health_issues import health_issues
 from tactomo.stream.control import Control
@@ -186,7 +186,7 @@ class Status:
 
 def source(ports: list[PortReader]) -> str:
     """Return what the scans come from."""
-    if any(port.url.startswith(f"{REPLAY_SCHEME}:") for port in ports):
+    if is_replayed(port.url for port in ports):
         return "replay"
     names = [port.hello.device_id for port in ports if port.hello is not None]
     if not names:

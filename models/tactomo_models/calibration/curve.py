@@ -186,6 +186,15 @@ def _columns(readings: Sequence[Reading]) -> _Columns:
     )
 
 
+def refuse_mpa(top_kpa: float) -> None:
+    """Raise CalibrationError where the largest pressure is less than any calibration has."""
+    if top_kpa < MIN_KPA:
+        raise CalibrationError(
+            f"the largest pressure is {top_kpa:g} kPa; is it in MPa, or the indenter's area too "
+            "large?"
+        )
+
+
 def _check_units(data: _Columns) -> None:
     if not len(data.kpa):
         raise CalibrationError("there are no readings; take some with the skin pressed")
@@ -195,10 +204,7 @@ def _check_units(data: _Columns) -> None:
             f"a pressure of {top:g} kPa is more than any skin bears; is it in Pa, or the "
             "indenter's area too small?"
         )
-    if top < MIN_KPA:
-        raise CalibrationError(
-            f"the largest pressure is {top:g} kPa; is it in MPa, or the indenter's area too large?"
-        )
+    refuse_mpa(top)
     if data.magnitude.max() > MAX_MAGNITUDE:
         raise CalibrationError(
             f"a magnitude of {data.magnitude.max():g} is no relative change of conductivity; is "

@@ -120,6 +120,17 @@ def test_a_load_cell_that_feels_a_force_on_a_bare_sheet_is_named(
     assert not free.flags
 
 
+def test_readings_on_a_bare_sheet_before_and_after_a_press_are_not_two_in_a_row(
+    reconstructor: Reconstructor, skin: Skin, scan: FloatArray
+) -> None:
+    """A cell feels a press a frame before the sheet does, and a frame longer."""
+    reconstructor.reset()
+    bare, felt = skin.scan()["magnitude"], [("load_cell", BALL_N / 2 + 5)]
+    frames = [reconstructor.reconstruct(each, None, companions=felt) for each in (bare, scan, bare)]
+    assert [bool(frame.contacts) for frame in frames] == [False, True, False]
+    assert not any(Flag.COMPANION_DISPUTED in frame.flags for frame in frames)
+
+
 @pytest.mark.parametrize("factor", [pytest.param(0.5, marks=pytest.mark.slow), 2.0])
 def test_a_load_cell_that_is_wrong_costs_a_moving_scene_nothing(
     sensor: SensorDescription, skin: Skin, monkeypatch: pytest.MonkeyPatch, factor: float
