@@ -187,7 +187,7 @@ class FrameMaker:
             share = np.maximum(areas.on_map.sum(axis=(1, 2)), 1e-12)
             size = np.asarray((image * (areas.on_map > 0)).sum(axis=(1, 2)) / share)
         assert size is not None
-        return areas, size, np.broadcast_to(estimate.magnitude_sigmas, len(areas))
+        return areas, size, np.full(len(areas), estimate.magnitude_sigmas)
 
     def check(self, estimate: Estimate) -> None:
         """Raise DataError for an estimate that cannot be shown."""

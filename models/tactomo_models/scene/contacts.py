@@ -161,11 +161,12 @@ def pressure_map(
     """Each contact's pressure on its area; NaN, and not 0, where it is touched but unknown."""
     touched = 0.05  # share of a node that a contact covers, from which it is touched
     values = np.array([contact.pressure_kpa for contact in contacts])
-    fused = map_of(areas, values)
-    if pressure_kpa is not None and len(areas):
+    if pressure_kpa is None or not contacts:
+        fused = map_of(areas, values)
+    else:
         mean = (areas.on_map > 0).astype(float)
         whole = np.maximum(np.einsum("kyx,yx->k", mean, pressure_kpa), 1e-12)
-        scale = np.nan_to_num(values * areas.on_map.sum(axis=(1, 2)) / whole)
+        scale = np.where(np.isnan(values), 0.0, values) * areas.on_map.sum(axis=(1, 2)) / whole
         fused = np.einsum("k,kyx,yx->yx", scale, mean, pressure_kpa).astype(np.float32)
     fused[(areas.on_map[np.isnan(values)] > touched).any(axis=0)] = np.nan
     return fused

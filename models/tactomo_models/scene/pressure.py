@@ -121,15 +121,16 @@ class PressureCurve:
 
     def spread(self, magnitude: FloatArray, sigma: FloatArray) -> FloatArray:
         """Standard uncertainty in kPa that a magnitude's own one makes, same shape."""
-        return np.asarray(self._beyond(magnitude + sigma) - self._beyond(magnitude - sigma)) / 2
+        low, high = self._beyond(magnitude + np.array([-sigma, sigma]))
+        return np.asarray(high - low) / 2
 
     def skewed_spread(self, magnitude: FloatArray, down: FloatArray, up: FloatArray) -> FloatArray:
         """The same of one that differs downwards and upwards: from the mode of a split normal.
 
         Source: Wallis, "The two-piece normal", Statistical Science 29 (2014), section 2.
         """
-        at = self._beyond(magnitude)
-        less, more = at - self._beyond(magnitude - down), self._beyond(magnitude + up) - at
+        low, at, high = self._beyond(magnitude + np.array([-down, np.zeros_like(up), up]))
+        less, more = at - low, high - at
         return np.asarray(np.sqrt(less**2 - less * more + more**2))
 
     def sigma(self, magnitude: FloatArray) -> FloatArray:
@@ -199,10 +200,14 @@ class PressureCurve:
         """Pressure in kPa, any shape, by which a peak that falls exceeds an even pressure."""
         return np.asarray(self.falling._beyond(magnitude) - self.pressure(magnitude))
 
+    @cached_property
+    def _end_slopes(self) -> FloatArray:
+        """Pressure per magnitude of the first piece and the last, kPa."""
+        return np.asarray((np.diff(self.pressure_kpa) / np.diff(self.magnitude))[[0, -1]])
+
     def _beyond(self, magnitude: FloatArray) -> FloatArray:
         """Pressure with the end pieces prolonged, so that a spread does not shrink at the ends."""
-        m, kpa = self.magnitude, self.pressure_kpa
-        first, last = np.diff(kpa)[[0, -1]] / np.diff(m)[[0, -1]]
+        m, (first, last) = self.magnitude, self._end_slopes
         outside = first * np.minimum(magnitude - m[0], 0) + last * np.maximum(magnitude - m[-1], 0)
         return np.asarray(self.pressure(magnitude) + outside)
 
@@ -246,8 +251,8 @@ def pressures_of(
     columns = (felt, felt_sigma, highest, up)
     ranges = tuple(
         curve.range_of(size, error, was, highest=(peak_size, peak_error))
-        for (size, error, peak_size, peak_error), was in zip(
-            np.column_stack(columns).tolist(), lasts, strict=True
+        for size, error, peak_size, peak_error, was in zip(
+            *(column.tolist() for column in columns), lasts, strict=True
         )
     )
     within = np.array([r is PressureRange.WITHIN for r in ranges], bool)
@@ -255,7 +260,7 @@ def pressures_of(
     peak = curve.pressure(highest)
     spread, own = curve.spread(highest, highest_sigma), curve.sigma(highest)
     peak_sigma = np.hypot(np.maximum(spread, curve.skewed_spread(highest, down, up)), own)
-    least = curve.least(highest, down)
+    least = np.where(above, curve.least(highest, down), np.nan)
     if field is not None:
         # The curve in force may be another than the description's table, as after a calibration.
         by_curve = peak / np.maximum(field.peak_kpa, 1e-12)
@@ -271,23 +276,23 @@ def pressures_of(
         of_area = (kpa - slope * magnitude) * area_sigmas_m2
         of_pressure = np.hypot(curve.spread(magnitude, apart), own) * areas_m2
         force_sigma = 1e3 * np.hypot(of_pressure, of_area)
+    most = curve.bound(highest, up)
     # Where nobody has told how the pressure falls, it may as a ball's does.
     may_fall = np.isnan(nothing if field is None else field.edge)
-    of_fall = np.where(may_fall, FALLING_SHARE**0.5 * curve.excess(highest), 0.0)
-    most = np.where(may_fall, curve.falling.bound(highest, up), curve.bound(highest, up))
+    if may_fall.any():
+        of_fall = np.where(may_fall, FALLING_SHARE**0.5 * curve.excess(highest), 0.0)
+        peak_sigma = np.hypot(peak_sigma, of_fall)
+        most = np.where(may_fall, curve.falling.bound(highest, up), most)
     is_force = within | (~above & curve.covers(highest, highest_sigma))
-    at_least = np.maximum(force - ONE_SIDED_95 * np.nan_to_num(force_sigma), 0.0)
-
-    def told(value: FloatArray, bound: FloatArray, known: BoolArray = within) -> FloatArray:
-        return np.where(known, value, np.where(above, bound, np.nan))
-
+    known_sigma = np.where(np.isnan(force_sigma), 0.0, force_sigma)
+    least_force = np.maximum(force - ONE_SIDED_95 * known_sigma, 0.0)
     return Pressures(
-        kpa=told(kpa, least * kpa / np.maximum(peak, 1e-12)),
-        sigma_kpa=told(sigma, nothing),
-        force_n=told(force, at_least, is_force),
-        force_sigma_n=told(force_sigma, nothing, is_force),
+        kpa=np.where(within, kpa, least * kpa / np.maximum(peak, 1e-12)),
+        sigma_kpa=np.where(within, sigma, np.nan),
+        force_n=np.where(is_force, force, np.where(above, least_force, np.nan)),
+        force_sigma_n=np.where(is_force, force_sigma, np.nan),
         ranges=ranges,
-        peak_kpa=told(peak, least),
-        peak_sigma_kpa=told(np.hypot(peak_sigma, of_fall), nothing),
+        peak_kpa=np.where(within, peak, least),
+        peak_sigma_kpa=np.where(within, peak_sigma, np.nan),
         max_kpa=np.where(above, np.inf, most),
     )
