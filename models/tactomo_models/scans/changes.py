@@ -62,7 +62,7 @@ class Changes:
     # shown half of the time may be in it
     hides: bool = False
 
-    @property
+    @cached_property
     def is_factor(self) -> bool:
         """Whether a factor that all voltages share, such as a gain's, explains them to noise."""
         count = int(np.count_nonzero(self.precision))
@@ -129,7 +129,7 @@ def inflated(error_share: FloatArray, valid: BoolArray) -> FloatArray:
         valid: (M,) which voltages count.
     """
     together = max(np.count_nonzero(valid) / ERROR_DIRECTIONS, 1.0)
-    return np.asarray(1 + (together - 1) * error_share)
+    return 1 + (together - 1) * error_share
 
 
 def towards_pressing(

@@ -211,12 +211,12 @@ class ScanCheck:
         wrong |= outlier
         if suspect is not None:
             wrong |= suspect
+        if not wrong.any():
+            return Verdict(usable, flags)
         if (unread := self._usable & ~np.isfinite(read)).any():
             # A drive of which nothing was read is the device's fault, and no lead's.
             whole = (unread | ~self._wiring.drives | ~self._usable).all(axis=1)
             wrong &= ~self._wiring.drives[whole].any(axis=0)
-        if not wrong.any():
-            return Verdict(usable, flags)
         electrodes = self._wiring.faulty_electrodes(wrong)
         if electrodes:
             flags |= Flag.ELECTRODE_FAULT
@@ -233,9 +233,9 @@ class ScanCheck:
         same_clipped = 4  # voltages of exactly the same, largest size: beside noise, no chance
         alike = 1.01  # ratio within which they may come out the same by symmetry without noise
         top = size >= size.max() * (1 - rounding)
-        if not saturated and not size.any():  # nothing usable: alike, and at no limit
-            return None
         if not saturated and np.count_nonzero(top) < same_clipped:
+            return None
+        if not saturated and not size.any():  # nothing usable: alike, and at no limit
             return None
         expected = self._size[top]
         if not saturated and self._noiseless and expected.max() <= alike * expected.min():
@@ -253,13 +253,13 @@ class ScanCheck:
         both = usable[i] & usable[j]
         if np.count_nonzero(both) < 4:
             return 1.0, 1.0, unequal
-        ratio = max(1.0, _typical(square[both] / self._pair_variance[both]))
+        ratio = max(1.0, _typical((square / self._pair_variance)[both]))
         gains = allowed * allowed
-        interference = np.sqrt(_typical((square / (self._pair_variance + gains))[both]))
-        bad = np.flatnonzero((square > OUTLIER**2 * (ratio * self._pair_variance + gains)) & both)
+        interference = _typical((square / (self._pair_variance + gains))[both])
+        bad = both & (square > OUTLIER**2 * (ratio * self._pair_variance + gains))
         unequal[i[bad]] = True
         unequal[j[bad]] = True
-        return ratio**0.5, float(interference), unequal
+        return ratio**0.5, interference**0.5, unequal
 
 
 def _typical(squares: FloatArray) -> float:

@@ -66,14 +66,14 @@ class Repeats:
         None where nothing can be told: of the first scan, and of those without noise at the tare.
         """
         earlier = self._earlier.get(channel, np.empty((0, len(scan))))
-        self._earlier[channel] = np.vstack([earlier[1 - EARLIER :], scan])
+        self._earlier[channel] = np.concatenate([earlier[1 - EARLIER :], scan[None]])
         noise: Any = getattr(reference, f"{channel}_noise", None)
         if not len(earlier) or not _is_noisy(reference, noise, scan):
             return None
-        told = np.isfinite(scan) & np.isfinite(noise) & (noise > 0)
-        with np.errstate(over="ignore"):
-            changes = (scan[told] - earlier[:, told]) / noise[told]
-            squares = np.einsum("nm,nm->n", changes, changes)
+        told = np.isfinite(scan) & (noise > 0) & (noise < np.inf)
+        with np.errstate(all="ignore"):
+            changes = np.where(told, (scan - earlier) / noise, 0.0)
+            squares = (changes * changes).sum(axis=1)
         if (squares < 2 * MIN_NOISE**2 * np.count_nonzero(told)).any():
             apart = np.abs(scan - earlier)
             last_bit = apart.min(initial=np.inf, where=apart > 0)
@@ -94,4 +94,4 @@ def _is_noisy(reference: Reference | None, noise: FloatArray | None, scan: Float
     if reference is None or not reference.is_noise_measured or noise is None:
         return False
     differs = bool(2 * np.count_nonzero(noise) > len(noise))
-    return differs and bool(np.any(noise > 1e-12 * np.abs(scan)))
+    return differs and bool((noise > 1e-12 * np.abs(scan)).any())

@@ -23,7 +23,7 @@ from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.robust import median, robust_sigma
 from tactomo_models.scans.changes import WRONG_WAY, Changes, inflated, missing
 from tactomo_models.scans.companion_forces import CompanionForce, CompanionReading
-from tactomo_models.scans.frame_noise import FrameNoiseEstimator, hides_press, is_noise, noise_limit
+from tactomo_models.scans.frame_noise import FrameNoiseEstimator, hides_press, noise_limit
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import (
     Flag,
@@ -85,9 +85,8 @@ class ChannelResult(NamedTuple):
     """What is to be had of a scan."""
 
     changes: Changes | None  # None where there is too little to go by; a flag says so
-    flags: Flag
+    flags: Flag  # that this scan raises, beside those of its reference
     electrodes: list[int]  # those left out, ascending
-    own_flags: Flag  # those of `flags` that this scan raises, and not its reference
 
 
 class ChannelTare:
@@ -214,12 +213,12 @@ class ChannelTare:
         self._check_length(scan, f"a {self._name} scan")
         scan = self._polarity.apply(scan)
         verdict = self._check.examine(scan, saturated=saturated)
-        valid, flags = verdict.usable, self.flags | verdict.flags
+        valid, flags = verdict.usable, verdict.flags
         electrodes = sorted({*self._electrodes, *verdict.electrodes})
         count = int(np.count_nonzero(valid))
         if count < self._least_valid or not scan[valid].any():
             gone = missing(self._name) | Flag.INVALID_VOLTAGE
-            return ChannelResult(None, flags | gone, electrodes, verdict.flags | gone)
+            return ChannelResult(None, flags | gone, electrodes)
         factor = 1.0 if drift is None else np.exp(drift)
         change = np.where(valid, scan - self.reference * factor, 0.0) * (self._per_volt / factor)
         square = change * change
@@ -231,7 +230,8 @@ class ChannelTare:
         typical = median(square[valid]) / median_square
         error = self._error_share**2 * (square + typical)
         squares = (square / variance)[valid]
-        statistic, quiet = float(squares.sum()), is_noise(squares, freedom)
+        statistic = float(squares.sum())
+        quiet = statistic < noise_limit(count, freedom)
         if creep is not None:
             unfollowed = (change if quiet else 0.0) + np.sign(self.reference) * creep
             shown = float((valid * unfollowed**2 / variance).sum()) + (0 if quiet else count)
@@ -249,7 +249,7 @@ class ChannelTare:
             # A gain behind what makes the noise takes the noise along; one before leaves it.
             scale = max(abs(common), 1.0)
             with np.errstate(over="ignore"):  # absurd volts are no factor
-                beyond = float(np.mean((over / scale - common / scale) ** 2 / variance[valid]))
+                beyond = float(((over / scale - common / scale) ** 2 / variance[valid]).mean())
         changes = Changes(
             change=change,
             weight=valid / np.sqrt(noise + error),
@@ -264,7 +264,7 @@ class ChannelTare:
             signal_beyond_factor=beyond**0.5,
             hides=hides,
         )
-        return ChannelResult(changes, flags, electrodes, flags & ~self.flags | verdict.flags)
+        return ChannelResult(changes, flags, electrodes)
 
     def _hides(self, change: FloatArray, variance: FloatArray, freedom: float, count: int) -> bool:
         """Whether a press that would show by the tare's noise may be in a quiet, noisy scan."""
@@ -347,16 +347,17 @@ class Tare:
         changes: dict[Channel, Changes] = {}
         flags = own_flags = Flag(0)
         faults: list[str] = []
-        for name, scan in ((Channel.MAGNITUDE, magnitude), (Channel.STRUCTURE, structure)):
-            if name not in self.sensor.description.channels:
-                continue
+        scans = {Channel.MAGNITUDE: magnitude, Channel.STRUCTURE: structure}
+        for name in self.sensor.description.channels:
+            scan = scans[name]
             if scan is None or name not in self.channels:
                 absent = missing(name) if scan is None else Flag.NO_REFERENCE
                 flags, own_flags = flags | absent, own_flags | absent
                 continue
             moved = (getattr(self.reference, f"{name}_{what}") for what in ("drift", "creep"))
-            result = self.channels[name].compare(scan, *moved, saturated=name in saturated)
-            flags, own_flags = flags | result.flags, own_flags | result.own_flags
+            channel = self.channels[name]
+            result = channel.compare(scan, *moved, saturated=name in saturated)
+            flags, own_flags = flags | channel.flags | result.flags, own_flags | result.flags
             if result.electrodes:
                 faults.append(_named(name, result.electrodes))
             if result.changes is not None:
