@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -22,13 +23,42 @@ from tactomo.scans import Felt
 STALE_US: Final = 500_000
 STALE_PERIODS: Final = 3
 """A companion that was silent for longer than both has no reading."""
+FROZEN_TIMES: Final = 10
+"""One that reads the very same for so much longer than ever, and for STALE_US, is frozen."""
+KNOWN_CHANGES: Final = 100
+"""Of a companion's readings, that tell for how long it may read the very same."""
 LAGS: Final = 4.0
 """Time constants after which a first-order lag has followed, to 2 %."""
 
 
 class _Reading(NamedTuple):
     device_us: int
-    value: float  # NaN where the device clipped
+    value: float  # NaN where the device clipped, or repeats itself
+
+
+@dataclass
+class _Run:
+    """Readings of one companion that are the very same: such as a frozen converter repeats."""
+
+    value: float
+    begin_us: int
+    end_us: int
+    longest_us: int = 0  # of those before
+    changes: int = 0
+
+    @property
+    def is_frozen(self) -> bool:
+        patience_us = max(STALE_US, FROZEN_TIMES * self.longest_us)
+        return self.changes >= KNOWN_CHANGES and self.end_us - self.begin_us > patience_us
+
+    def take(self, value: float, device_us: int) -> None:
+        if value == self.value and device_us >= self.end_us:
+            self.end_us = device_us
+            return
+        if not self.is_frozen:
+            self.longest_us = max(self.longest_us, self.end_us - self.begin_us)
+            self.changes += 1
+        self.value, self.begin_us, self.end_us = value, device_us, device_us
 
 
 class CompanionLog:
@@ -38,10 +68,12 @@ class CompanionLog:
         self._names = description.companion_indices
         self._companions = description.companion
         self._kept: dict[str, deque[_Reading]] = {}
+        self._runs: dict[str, _Run] = {}
 
     def forget(self) -> None:
         """Forget all readings: what comes does not go on from them."""
         self._kept.clear()
+        self._runs.clear()
 
     def take(self, packet: CompanionReading) -> bool:
         """Keep a reading; return whether the description knows its companion.
@@ -61,6 +93,10 @@ class CompanionLog:
                 return True
             else:
                 kept.clear()
+        run = self._runs.setdefault(name, _Run(value, packet.device_us, packet.device_us))
+        run.take(value, packet.device_us)
+        if run.is_frozen:
+            value = math.nan
         kept.append(_Reading(packet.device_us, value))
         return True
 

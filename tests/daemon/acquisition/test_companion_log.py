@@ -70,6 +70,21 @@ def test_a_clipped_reading_is_no_number_and_an_index_must_be_known() -> None:
     assert not log.take(CompanionReading(1, ScanFlag(0), 20 * MS, 1.0))
 
 
+def test_one_that_repeats_a_reading_for_longer_than_ever_is_frozen() -> None:
+    def value_after(*readings: float) -> float:
+        log = log_of(*((10 * at, value) for at, value in enumerate(readings)))
+        return log.at(10 * (len(readings) - 1) * MS)[0].value
+
+    fine = [float(at) for at in range(150)]
+    assert math.isnan(value_after(*fine, *[7.0] * 60))
+    assert value_after(*fine, *[7.0] * 60, 8.0) == 8.0
+    assert math.isnan(value_after(*fine, *[7.0] * 60, 8.0, *[7.0] * 60))
+    assert value_after(*fine, *[7.0] * 40) == 7.0
+    # One that is so coarse that it read the same for 0.2 s before.
+    assert value_after(*[3.0] * 20, *fine, *[7.0] * 190) == 7.0
+    assert value_after(*[7.0] * 500) == 7.0
+
+
 def test_companions_go_by_their_index_or_else_their_place() -> None:
     both = sensor(pad={**CELL, "index": 7}, cell=CELL)
     assert both.companion_indices == {7: "pad", 1: "cell"}
