@@ -94,7 +94,7 @@ class Companions:
                 self._on_event(
                     "companion_lost",
                     f"companion {name} has no reading within its limits; the sheets stand alone",
-                    "check its cable, and `index` and `limits` in the sensor description; if it repeats "
-                    "one reading, switch it off and on",
+                    "check its cable, and `index` and `limits` in the sensor description; if it "
+                    "repeats one reading, switch it off and on",
                     name,
                 )
