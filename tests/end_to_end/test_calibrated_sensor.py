@@ -58,6 +58,21 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 
 
 @pytest.mark.slow
+def test_a_guided_session_doubts_kilograms(bench: Bench) -> None:
+    bench.contact(220)
+    options = ("--sensor", NAME, "--address", bench.daemon.stream, "--diameter-mm", "30")
+    with Terminal("calibrate", "live", *options) as terminal:
+        for answer, is_doubted in ((0.220 * AREA_MM2 / 9.81, True), (0.220 * AREA_MM2, False)):
+            terminal.wait_for("Reading 1, going")
+            terminal.enter("")
+            terminal.wait_for("Load cell in N")
+            terminal.enter(f"{answer:.2f}")
+            said = terminal.wait_for("Still wanted")
+            assert ("reading in newtons" in said) == is_doubted
+            terminal.enter("undo")
+
+
+@pytest.mark.slow
 def test_a_guided_session_makes_pressures_right(bench: Bench, tmp_path: Path) -> None:
     wrong = bench.contact(200)
     assert wrong.pressure_kpa is not None

@@ -86,3 +86,22 @@ def test_a_guided_session_makes_places_right(bench: Bench) -> None:
     taught, is_taught = bench.errors_mm()
     assert all(is_taught)
     assert np.median(taught) < 0.7 * np.median(untaught), (taught, untaught)
+
+
+@pytest.mark.slow
+def test_what_no_press_can_be_is_not_taken(bench: Bench) -> None:
+    with Terminal("teach", "live", "--sensor", NAME, "--address", bench.daemon.stream) as terminal:
+        terminal.wait_for("Take everything off the skin")
+        terminal.enter("")
+        for answer, reply in (
+            ("1250 -30", "(1250, -30) mm is off the skin"),
+            ("nan 3", "(nan, 3) mm is off the skin"),
+            ("12.5 -30 -8", "-8 N presses nothing"),
+            ("12,5 30", "two numbers"),
+        ):
+            terminal.wait_for("mm, hold, and Enter")
+            terminal.enter(answer)
+            terminal.wait_for(reply)
+        terminal.enter("done")
+        assert terminal.wait() == 1
+    assert "there are no presses" in terminal.shown

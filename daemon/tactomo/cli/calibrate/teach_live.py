@@ -82,6 +82,8 @@ class _Session:
                 say(f"presses kept in {self._file}: {self._count}")
         except (KeyboardInterrupt, EOFError):
             say("\nstopped")
+        if not self._count:
+            raise TactomoError("there are no presses", "take some with the skin pressed")
         return description, self._subject
 
     @property
@@ -115,11 +117,20 @@ class _Session:
         force_n = np.nan
         if word:
             try:
-                x_mm, y_mm, *rest = (float(part) for part in word.replace(",", " ").split())
+                word = word.replace(", ", " ")
+                # Mixed with blanks, a comma may be a decimal one.
+                x_mm, y_mm, *rest = map(float, word.split("," if "," in word else None))
                 (force_n,) = rest or [np.nan]
             except ValueError:
                 self._console.print("two numbers, such as 12.5 -30, or three with newtons, please")
                 return True
+        # At the end, one slip would refuse all presses.
+        if not description.on_sheet(1e-3 * np.array(x_mm), 1e-3 * np.array(y_mm)):
+            self._console.print(f"not taken: ({x_mm:g}, {y_mm:g}) mm is off the skin")
+            return True
+        if not (np.isnan(force_n) or 0 < force_n < np.inf):
+            self._console.print(f"not taken: {force_n:g} N presses nothing")
+            return True
         heard = self._heard(HOLD_S)
         if why := self._why_not(heard):
             self._console.print(f"not taken: {why}")
