@@ -8,6 +8,7 @@ import resource
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,11 @@ from mcap_protobuf.decoder import DecoderFactory
 from mcap_ros2.decoder import DecoderFactory as Ros2DecoderFactory
 from recorded_grasp import FRAMES, PERIOD_NS, SENSOR, START_NS, contacts_of, write_grasp
 from small_sensor import SMALL
+from tactomo.cli.files.recorded_frames import recorded_frames
 from tactomo.recordings.recording import Origin
 from tactomo.recordings.recording_writer import RecordingWriter
-from tactomo_models import Press, SkinSimulator, load_description
+from tactomo_models import Press, Reconstruction, Reconstructor, SkinSimulator, load_description
+from tactomo_models.scans.measurement import Measurement
 from tactomo_protocol import Channel
 from waiting import wait_until
 
@@ -229,6 +232,22 @@ def test_what_holds_no_frames_is_reconstructed_first(tactomo: Run, tmp_path: Pat
         assert each.message.log_time == stamp.sec * 1_000_000_000 + stamp.nanosec
     tactomo("plot", "bare.mcap", "-o", "made.png", status=0)
     assert not list(tmp_path.glob(".tactomo*"))
+
+
+@pytest.mark.slow
+def test_a_frame_that_was_made_just_now_is_not_stale(
+    tactomo: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slowly(self: Reconstructor, measurement: Measurement) -> Reconstruction:
+        time.sleep(0.1)
+        return solve(self, measurement)
+
+    solve = Reconstructor.solve
+    monkeypatch.setattr(Reconstructor, "solve", slowly)
+    with recorded_frames(bare_recording(tactomo, tmp_path, scans_pressed=1), None) as made:
+        frames = [moment.frame for moment in made.moments("contacts")]
+    assert max(frame.age_s for frame in frames) > 0.5
+    assert all(frame.is_known for frame in frames)
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import heapq
+import math
 import tempfile
 import warnings
 from collections import Counter
@@ -80,7 +81,9 @@ class RecordedFrames:
         """Yield frames that were made of a replay, which knows its own times only."""
         for file, made in zip(self._given.files, self._remade, strict=True):
             arrivals = _arrivals(file)
-            for frame in made.frames(kind) if made.has_frames else ():
+            # Their ages are of this replay: whether a frame was stale live, nobody knows.
+            every = made.frames(kind, stale_after_s=math.inf) if made.has_frames else ()
+            for frame in every:
                 found = (
                     clock_ns for counter, clock_ns in arrivals if counter == frame.scan_counter
                 )
