@@ -65,7 +65,6 @@ class Account:
     fitted: FittedField
     jacobian: FloatArray  # (sum M, N + 1) of its weighted residual
     likelihood: Likelihood  # of that residual
-    prior: tuple[FloatArray, FloatArray]  # see `FieldFit.prior`
     chi_squared: float  # what it leaves of the data
     at_minimum: bool = False
 
@@ -93,7 +92,7 @@ class Account:
     @cached_property
     def _laplace(self) -> tuple[float, FloatArray]:
         """Made where asked for: of most fields on the way to a minimum nobody asks."""
-        of = self.jacobian, self.chi_squared, *self.prior
+        of = self.jacobian, self.chi_squared, *self.fitted.prior
         return laplace(self.likelihood, self.family, self.fitted.parameters, *of)
 
     @property
@@ -120,7 +119,7 @@ def account_of(fit: FieldFit, fitted: FittedField, frame: Frame) -> Account:
     likelihood = frame.likelihood
     jacobian = fit.jacobian(fitted, frame.measured)
     chi_squared = likelihood.chi_squared(fitted.residual)
-    return Account(fitted, jacobian, likelihood, fit.prior(fitted), chi_squared)
+    return Account(fitted, jacobian, likelihood, chi_squared)
 
 
 def outline_errors(
@@ -251,12 +250,12 @@ def _stepped(
     light = family.light(fitted.parameters) & stays_light
     damping, growth, most = fitted.damping, 5.0, np.inf
     while damping < MAX_DAMPING:
-        step = bounded_step(normal, gradient, 0.1 * damping * account.prior[0])
+        step = bounded_step(normal, gradient, 0.1 * damping * account.fitted.prior[0])
         step = limited_step(fit, family, fitted.parameters, fitted.log_ratio, light, step)
         gain = float(-(2 * gradient + normal @ step) @ step)
         if gain * account.unit < NEGLIGIBLE:
             return None
-        length = float(account.prior[0] @ step**2)
+        length = float(account.fitted.prior[0] @ step**2)
         if length <= most:
             parameters, ratio = fitted.parameters + step[:-1], fitted.log_ratio + float(step[-1])
             trial = fit.evaluate(family, parameters, ratio, frame.measured)

@@ -11,6 +11,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable
 from enum import StrEnum, auto
+from functools import cache
 
 import numpy as np
 from scipy.special import gammaln
@@ -90,19 +91,11 @@ def marginals(log_ratios: FloatArray) -> FloatArray:
             contact cannot be of a kind.
     """
     likely = np.exp(log_ratios - log_ratios.max(axis=1, keepdims=True))
-    count, prior = len(likely), TOLD * np.array([*SHARES.values()])
-    # By how many of the other contacts are of each kind; the last kind has what is left.
-    of_each = np.indices((count,) * (len(SHARES) - 1)).reshape(len(SHARES) - 1, -1)
-    of_each = np.vstack([of_each, count - 1 - of_each.sum(axis=0)])
+    count, by_kind = len(likely), _by_counts(len(likely))
     one_more = count ** np.arange(len(SHARES) - 1)[::-1]  # where a count stands that is larger by 1
-    pseudo = prior[:, None] + of_each
-    weight = np.where(
-        of_each[-1] >= 0, gammaln(np.maximum(pseudo, prior.min())).sum(axis=0), -np.inf
-    )
-    by_kind = np.exp(weight - weight.max(initial=-np.inf)) * pseudo
     found = np.empty_like(likely)
     for k in range(count):
-        ways = np.zeros(of_each.shape[1])
+        ways = np.zeros(by_kind.shape[1])
         ways[0] = 1.0
         for others in np.delete(likely, k, axis=0):
             more = others[-1] * ways
@@ -111,6 +104,23 @@ def marginals(log_ratios: FloatArray) -> FloatArray:
             ways = more / more.max()
         found[k] = likely[k] * (by_kind @ ways)
     return np.asarray(found / found.sum(axis=1, keepdims=True))
+
+
+@cache
+def _by_counts(count: int) -> FloatArray:
+    """How likely one of so many contacts is of each kind, beside others of counts that are.
+
+    (kinds, count ** (kinds - 1)), by how many of the others are of each kind but the last, which
+    has what is left; not normalised.
+    """
+    prior = TOLD * np.array([*SHARES.values()])
+    of_each = np.indices((count,) * (len(SHARES) - 1)).reshape(len(SHARES) - 1, -1)
+    of_each = np.vstack([of_each, count - 1 - of_each.sum(axis=0)])
+    pseudo = prior[:, None] + of_each
+    weight = np.where(
+        of_each[-1] >= 0, gammaln(np.maximum(pseudo, prior.min())).sum(axis=0), -np.inf
+    )
+    return np.asarray(np.exp(weight - weight.max(initial=-np.inf)) * pseudo)
 
 
 def kind_of(contact: FloatArray) -> Kind:

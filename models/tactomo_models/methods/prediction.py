@@ -195,7 +195,7 @@ class _At:
 
 def _end(fit: FieldFit, at: _At, frame: Frame, own: IntArray, unit: float) -> Prediction:
     family, likelihood, J = at.family, frame.likelihood, at.jacobian
-    precision, offset = fit.prior_of(family, at.parameters, at.log_ratio)
+    precision, offset = fit.prior(family, at.parameters, at.log_ratio)
     normal = J.T @ J
     normal[np.diag_indices(len(normal))] += precision
     gradient = J.T @ at.residual + precision * offset

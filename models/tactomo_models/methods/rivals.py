@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -100,7 +101,7 @@ def alternatives(
     may_differ: BoolArray,  # (K,) contacts that have another peak if they are of another kind
 ) -> list[list[Alternative]]:
     """What else each contact may be, where it is one contact."""
-    own = [kind_of(contact) for contact in contacts]
+    own = tuple(kind_of(contact) for contact in contacts)
     prior = _prior_odds(own)
     log_odds = _log_odds(own, rivals, prior)
     odds = np.exp(np.minimum(log_odds, MAX_LOG_ODDS))
@@ -121,7 +122,8 @@ def alternatives(
     return found
 
 
-def _prior_odds(own: Sequence[Kind]) -> FloatArray:
+@lru_cache(maxsize=64)  # a scene's kinds stay the same for many frames
+def _prior_odds(own: tuple[Kind, ...]) -> FloatArray:
     """Logarithms (K, kinds) of how likely it is before any data that one contact is another."""
     now = log_prior(own)
     return np.array(

@@ -320,7 +320,7 @@ class Search:
         which came there stays.
         """
         response = self.fit.responses.get(Channel.STRUCTURE)
-        precision, offset = account.prior
+        precision, offset = account.fitted.prior
         is_likely = precision[-1] * offset[-1] ** 2 < 1
         if not isinstance(response, SaturatingResponse) or is_likely or not _is_light(account):
             return account
@@ -380,7 +380,7 @@ class Search:
             return self._joined(belief, frame)
         return replace(
             belief,
-            since=Since.after(frame.measured, account.jacobian, account.prior[0]),
+            since=Since.after(frame.measured, account.jacobian, account.fitted.prior[0]),
             asked_peaks=_pressed_peaks(account),
             done=True,
         )

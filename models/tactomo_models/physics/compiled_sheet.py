@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -146,9 +147,9 @@ class CompiledAreas:
         self.where = where  # (p,) pressable nodes that they are around
         most = min(sheet.triangles, len(where) * sheet.most_around)
         nodes = min(sheet.support, 3 * most)
-        sizes = np.array([most, 3 * most, nodes, nodes + 1, nodes, nodes])
-        self._kept = np.empty(sizes.sum(), np.int64)
-        starts = (sizes.cumsum() - sizes).tolist()
+        sizes = (most, 3 * most, nodes, nodes + 1, nodes, nodes)
+        *starts, end = accumulate(sizes, initial=0)
+        self._kept = np.empty(end, np.int64)
         place = address(self._kept)
         # the same for C
         self.found = _Areas(0, 0, 0, 0, 0, *(place + 8 * start for start in starts))
@@ -276,8 +277,8 @@ class CompiledSheet:
         areas = self._areas(where)
         found, sheet = areas.found, self._sheet
         sizes = (sheet.pressable, sheet.voltages, sheet.voltages, found.nodes * sheet.fields)
-        kept = np.empty(sum(sizes) + found.rim * sheet.fields)
-        ends = np.cumsum(sizes).tolist()
+        ends = [*accumulate((*sizes, found.rim * sheet.fields))]
+        kept = np.empty(ends[-1])
         place = address(kept)
         if change is not None:
             kept[: ends[0]] = change

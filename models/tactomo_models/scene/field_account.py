@@ -23,7 +23,18 @@ from tactomo_models.scene.areas import AreaFinder, Areas
 from tactomo_models.scene.drawing import Drawing
 from tactomo_models.scene.evidence import Likelihood
 from tactomo_models.scene.field_fit import FieldFit, FittedField, Measured
-from tactomo_models.scene.parameters import E1, E2, EDGE, HOLE, PEAK, SIZE, UNIT_M, X, Y
+from tactomo_models.scene.parameters import (
+    E1,
+    E2,
+    EDGE,
+    HOLE,
+    PEAK,
+    PEAK_LIMITS,
+    SIZE,
+    UNIT_M,
+    X,
+    Y,
+)
 from tactomo_models.scene.pressure import ONE_SIDED_95, FieldContacts
 from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import GradedResponse, SaturatingResponse
@@ -79,6 +90,10 @@ class FieldAccountant:
         self._fit, self._areas = fit, areas
         self._graded = fit.responses.get(Channel.MAGNITUDE)
         self._saturating = fit.responses.get(Channel.STRUCTURE)
+        if isinstance(self._graded, GradedResponse):
+            peaks = np.geomspace(*PEAK_LIMITS, TABLED_PEAKS)
+            size, _ = self._graded.relative_change(self._graded.end_kpa * peaks)
+            self._reflection = ReflectionTable.of(peaks, size)
         x, y = areas.map_places
         self._cell_m = float(x[0, 1] - x[0, 0])
         self._step_m = self._cell_m / SAMPLES
@@ -133,8 +148,8 @@ class FieldAccountant:
         """Covariance (N + 1, N + 1) of a field's parameters and the log ratio."""
         likelihood = Likelihood.of(measured)
         information = likelihood.information(J, likelihood.chi_squared(fitted.residual))
-        precision = self._fit.prior(fitted)[0]
-        return np.asarray(np.linalg.inv(information + np.diag(precision)), np.float64)
+        information[np.diag_indices(len(information))] += fitted.prior[0]
+        return np.asarray(np.linalg.inv(information), np.float64)
 
     def _drawn(self, fitted: FittedField, measured: Measured, J: FloatArray | None) -> FieldAccount:
         near, (solid, share, pressure) = self._images(fitted)
@@ -352,7 +367,7 @@ class FieldAccountant:
         share, pressure = drawing.share, drawing.pressure_kpa
 
         def sigma(gradients: FloatArray) -> FloatArray:
-            return np.asarray(np.sqrt(np.einsum("ki,ij,kj->k", gradients, covariance, gradients)))
+            return np.asarray(np.sqrt((gradients @ covariance * gradients).sum(axis=1)))
 
         weight = mine * cell
         area = np.maximum(weight @ share, 1e-12)
@@ -455,12 +470,7 @@ class FieldAccountant:
             sides: (2, K) magnitudes under peaks, downwards and upwards, in `ONE_SIDED_95`.
             spreads: (3, K) mean pressures, areas and forces, root mean squares over these.
         """
-        graded, sides, spreads = self._graded, np.zeros((2, len(each))), np.zeros((3, len(each)))
-        assert isinstance(graded, GradedResponse)
-
-        lowest, highest = family.limits[:, PEAK]
-        peaks = np.geomspace(lowest, highest, TABLED_PEAKS)
-        table = ReflectionTable.of(peaks, graded.relative_change(family.unit_kpa * peaks)[0])
+        table, sides, spreads = self._reflection, np.zeros((2, len(each))), np.zeros((3, len(each)))
         for k, contact in enumerate(each):
             index = family.index[k, [SIZE, PEAK]]
             if index.min() < 0 or contact[PEAK] <= family.onset:
@@ -505,7 +515,7 @@ class FieldAccountant:
         size = fitted.family.index[:, SIZE]
         by_size = covariance[-1, size] / covariance[size, size]
         of_mesh = by_size * OUTLINE_ERROR * self._cell_m / np.exp(each[:, SIZE])
-        precision, offset = self._fit.prior(fitted)
+        precision, offset = fitted.prior
         sigma = np.sqrt(1 / precision[-1] + of_mesh @ of_mesh)
         return bool(abs(offset[-1]) > FAR_RATIO * sigma)
 

@@ -15,6 +15,7 @@ Jacobian go by the pressed area.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -80,6 +81,8 @@ class FittedField:
     # each sheet's (M,) noise-weighted misfit of the data
     residuals: Mapping[Channel, FloatArray] = field(repr=False)
     cost: float  # what is minimised, the prior included
+    # (N + 1,) inverse variances of parameters and log ratio, and their offsets from what is likely
+    prior: tuple[FloatArray, FloatArray] = field(repr=False)
     damping: float = 1.0  # Levenberg-Marquardt damping that its last step got through with
     # (K,) of companions, likewise weighted
     companion_residuals: FloatArray = field(default_factory=lambda: np.zeros(0), repr=False)
@@ -95,16 +98,16 @@ class FittedField:
     @cached_property
     def misfit(self) -> float:
         """Root mean square of the noise-weighted residual; about 1 where the model explains all."""
-        return float(np.sqrt(np.mean(self.residual**2)))
+        return _root_mean_square(self.residual)
 
-    @property
+    @cached_property
     def worst_misfit(self) -> float:
         """The misfit of the sheet that is explained worst."""
         return max(self.misfit_of(name) for name in self.residuals)
 
     def misfit_of(self, channel: Channel) -> float:
         """The same of one sheet."""
-        return float(np.sqrt(np.mean(self.residuals[channel] ** 2)))
+        return _root_mean_square(self.residuals[channel])
 
 
 @dataclass(frozen=True)
@@ -179,23 +182,22 @@ class FieldFit:
         Sheets that the estimate has not solved are solved.
         """
         if measured.keys() - fitted.solutions.keys():
-            again = self.evaluate(
+            return self.evaluate(
                 fitted.family,
                 fitted.parameters,
                 fitted.log_ratio,
                 measured,
                 solved=fitted.solutions,
             )
-            return again
-        judged = self._judged(
+        return self._judged(
             fitted.family,
             fitted.parameters,
             fitted.log_ratio,
             fitted.drawing,
             *self._compared(fitted, measured),
             measured,
+            damping=1.0 if fitted.converged else fitted.damping,
         )
-        return replace(judged, damping=1.0 if fitted.converged else fitted.damping)
 
     def evaluate(
         self,
@@ -243,14 +245,15 @@ class FieldFit:
         solutions: Mapping[Channel, Solution],
         residuals: Mapping[Channel, FloatArray],
         measured: Measured,
+        damping: float = 1.0,
     ) -> FittedField:
-        off = (log_ratio - self.likely) / self._ratio_sigma
-        away = _away(family, parameters)
+        precision, offset = self.prior(family, parameters, log_ratio)
         felt = np.zeros(0)
         if isinstance(measured, SheetsAndCompanions):
             weights, readings = measured.rows
             felt = _felt(weights, drawing) - readings
-        cost = sum(each @ each for each in residuals.values()) + felt @ felt + away + off**2
+        cost = sum(each @ each for each in residuals.values()) + felt @ felt
+        cost += precision @ offset**2
         return FittedField(
             family,
             parameters,
@@ -259,6 +262,8 @@ class FieldFit:
             solutions,
             residuals,
             float(cost),
+            (precision, offset),
+            damping,
             companion_residuals=felt,
         )
 
@@ -415,7 +420,7 @@ class FieldFit:
 
     def normal_equations(self, fitted: FittedField, J: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Matrix (N + 1, N + 1) and gradient (N + 1,) of half the linearised cost."""
-        precision, offset = self.prior(fitted)
+        precision, offset = fitted.prior
         normal = J.T @ J
         _diagonal(normal)[:] += precision
         return normal, J.T @ fitted.residual + precision * offset
@@ -424,16 +429,13 @@ class FieldFit:
         """A log ratio brought back to where it means something."""
         return float(min(max(log_ratio, self._least_ratio), self._most_ratio))
 
-    def prior(self, fitted: FittedField) -> tuple[FloatArray, FloatArray]:
-        """Inverse variances (N + 1,) of parameters and log ratio, and their offsets from it."""
-        return self.prior_of(fitted.family, fitted.parameters, fitted.log_ratio)
-
-    def prior_of(
+    def prior(
         self, family: Family, parameters: FloatArray, log_ratio: float
     ) -> tuple[FloatArray, FloatArray]:
-        """The same of parameters (N,) and a log ratio."""
-        precision = np.append(family.prior_precision, self._ratio_sigma**-2)
-        offset = np.append(parameters - family.prior_mean, log_ratio - self.likely)
+        """Inverse variances (N + 1,) of parameters (N,) and log ratio, and offsets from it."""
+        precision, offset = np.empty((2, len(parameters) + 1))
+        precision[:-1], precision[-1] = family.prior_precision, self._ratio_sigma**-2
+        offset[:-1], offset[-1] = parameters - family.prior_mean, log_ratio - self.likely
         return precision, offset
 
     def _step(self, fitted: FittedField, measured: Measured, budget: Budget) -> FittedField:
@@ -507,6 +509,5 @@ def _diagonal(matrix: FloatArray) -> FloatArray:
     return matrix.reshape(-1)[:: len(matrix) + 1]
 
 
-def _away(family: Family, parameters: FloatArray) -> float:
-    """Cost of parameters (N,) by what is likely of them."""
-    return float(family.prior_precision @ (parameters - family.prior_mean) ** 2)
+def _root_mean_square(values: FloatArray) -> float:
+    return math.sqrt(values @ values / len(values))

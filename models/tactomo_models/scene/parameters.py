@@ -14,6 +14,9 @@ MAX_BULGE = 0.25
 EDGE_LIMITS = (0.3, 1.0)
 HERTZ = 0.5
 FALLING_SHARE = 0.3  # of presses, before any data: see `methods.kinds.SHARES`
+# Of a peak, in units of the table's end: less leaves nothing to fit, beyond the table all that is
+# told is a lower bound.
+PEAK_LIMITS = (0.01, 3.0)
 # Place, size, elongation and bulges; the peak half of the table, which is made for such presses
 # (all of it loses 0.003 of the correlation on mixed presses, 0.3 on ordinary ones); edges as of
 # balls and fingers, holes of what presses with its rim.

@@ -44,6 +44,7 @@ from tactomo_models.scene.parameters import (
     HOLE,
     MAX_BULGE,
     PEAK,
+    PEAK_LIMITS,
     PRIOR_SIGMA,
     SIZE,
     SMALLEST_SIZE,
@@ -108,9 +109,6 @@ class PressureField:
         # and then there is the step from 1 to 0. ICC of tuning scenes without and with it: 0.989,
         # 0.991 at 40 dB, 0.954, 0.960 at 20 dB, 0.979, 0.981 of one graded sheet.
         of_triangles, of_step = 5 / 18, 1 / 3 - 2 / np.pi**2
-        # Of the table's end, that a peak may come to: less leaves nothing to fit, and beyond the
-        # table all that is told is a lower bound.
-        least, beyond = 0.01, 3.0
         x, y = np.ascontiguousarray(forward.bare.points[:, forward.bare.pressable])
         description = forward.description
         spacing = description.spacing_m
@@ -126,7 +124,7 @@ class PressureField:
         longest_m = np.hypot(description.width_m, description.height_m) / 2
         limits[:, SIZE] = SMALLEST_SIZE, np.log(longest_m)
         limits[:, HARMONIC:PEAK] = [[-MAX_BULGE], [MAX_BULGE]]
-        limits[:, PEAK] = least, beyond
+        limits[:, PEAK] = PEAK_LIMITS
         limits[:, EDGE] = EDGE_LIMITS  # where it is fitted: what is even is another kind
         return cls(
             x,

@@ -264,7 +264,7 @@ def test_parameters_scatter_as_their_covariance_says(sensor: Sensor, scene: str)
         truth = sensor.at(true, sensor.no_data())
         data = data_of(sensor.changes(truth), sigma, rng)
         found = sensor.settled(sensor.fit.compare(truth, data), data)
-        J, (precision, _) = sensor.fit.jacobian(found, data), sensor.fit.prior(found)
+        J, (precision, _) = sensor.fit.jacobian(found, data), found.prior
         covariance = np.linalg.inv(J.T @ J + np.diag(precision))
         spread = np.sqrt(np.diag(covariance))[:-1]
         off.append(((found.parameters - truth.parameters) / spread)[index])
