@@ -102,7 +102,8 @@ class Contact:
     #: uncertainty, or ``above``
     max_kpa: float | None = None
     #: Profile exponent γ: the pressure falls towards the edge as (1 − ρ²)^γ. 0 is flat, 0.5 is
-    #: Hertzian; nil where unknown
+    #: Hertzian; nil where unknown. What falls is taken for Hertzian, as under balls and fingers:
+    #: of a pressure that falls more steeply, such as a cone's, the peak and its bounds are too low
     edge: float | None = None
     #: Whether `x_mm`, `y_mm` and their uncertainties come from presses at known places (`tactomo
     #: teach`); so does `force_n` where the forces were known

@@ -240,11 +240,11 @@ def _by_converter(plan: Plan) -> Plan:
     return replace(plan, snr_db=CONVERTER_DB, snr_of="voltage")
 
 
-def _soft(draw: Draw) -> Plan:
-    def ball() -> Press:
-        return draw.press((10, 20), pressure_kpa=SOFT_KPA, profile="dome")
+def _soft(draw: Draw, profile: Profile = "dome") -> Plan:
+    def soft() -> Press:
+        return draw.press((10, 20), pressure_kpa=SOFT_KPA, profile=profile)
 
-    return _by_converter(draw.plan(draw.apart(1 + draw.number % 3, ball)))
+    return _by_converter(draw.plan(draw.apart(1 + draw.number % 3, soft)))
 
 
 def _displaced_m(draw: Draw) -> FloatArray:
@@ -401,6 +401,8 @@ REGIMES: Final[dict[str, Regime]] = {
     "light": Regime(lambda d: _by_converter(d.plan(d.scene(pressure_kpa=(5, 90))))),
     # balls, under which the pressure falls to the rim
     "soft": Regime(_soft),
+    # the same, but that the pressure falls more steeply than that of any kind that is fitted
+    "cones": Regime(lambda d: _soft(d, "cone")),
     # electrodes 1 mm off, contact impedances by 30 %, sheets uneven by 10 %
     "hand-made": Regime(lambda d: _by_hand(_ordinary(d), _displaced_m(d))),
     "soft-hand-made": Regime(lambda d: _by_hand(_soft(d), _displaced_m(d))),

@@ -11,7 +11,7 @@ import numpy as np
 from tactomo_models.arrays import FloatArray
 
 Shape = Literal["ellipse", "rectangle", "ring"]
-Profile = Literal["flat", "dome"]
+Profile = Literal["flat", "dome", "cone"]
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Press:
     #: an ellipse, a rectangle, or a ring (an ellipse with its inner half left out)
     shape: Shape = "ellipse"
     #: "flat", a punch that presses evenly, or "dome", a ball whose pressure falls to nothing at the
-    #: rim (Hertz) of the ellipse or of the ellipse around a rectangle
+    #: rim (Hertz) of the ellipse or of the ellipse around a rectangle; a "cone"'s falls evenly
     profile: Profile = "flat"
 
     def pressure_at(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray | float:
@@ -37,7 +37,8 @@ class Press:
             return self.pressure_kpa
         u, v = self._own_axes(x_m, y_m)
         rho = np.hypot(u / self.radius_m, v / (self.radius_y_m or self.radius_m))
-        return np.asarray(self.pressure_kpa * np.sqrt(np.maximum(1 - rho**2, 0.0)))
+        left = 1 - rho if self.profile == "cone" else np.sqrt(np.maximum(1 - rho**2, 0.0))
+        return np.asarray(self.pressure_kpa * np.maximum(left, 0.0))
 
     def _own_axes(self, x_m: FloatArray, y_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         cos, sin = np.cos(self.angle_rad), np.sin(self.angle_rad)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tactomo_models import Press
 from tactomo_models.arrays import FloatArray
-from tactomo_models.scene.press import strongest
+from tactomo_models.scene.press import Profile, strongest
 from tactomo_models.scene.tracking import FARTHEST_STEP_M, ContactTracker
 
 STEP_M = 0.001
@@ -41,17 +41,23 @@ def test_a_ring_is_open_in_the_middle() -> None:
     assert press.coverage(np.array([0.0, 0.015]), np.zeros(2), STEP_M).tolist() == [0.0, 1.0]
 
 
-def test_a_dome_presses_most_in_the_middle_and_not_at_its_rim() -> None:
-    """As a ball does (Hertz): the mean pressure is two thirds of the largest."""
-    dome = Press(0.01, -0.005, 150.0, 0.02, 0.012, 0.7, profile="dome")
+@pytest.mark.parametrize(
+    ("profile", "off_middle", "mean_kpa", "left"),
+    [("dome", 1e-3, 100.0, 0.6), ("cone", 0.05, 50.0, 0.2)],
+)
+def test_a_dome_or_cone_presses_most_in_the_middle_and_not_at_its_rim(
+    profile: Profile, off_middle: float, mean_kpa: float, left: float
+) -> None:
+    """As a ball does (Hertz), the mean pressure is two thirds of the largest; a cone's a third."""
+    dome = Press(0.01, -0.005, 150.0, 0.02, 0.012, 0.7, profile=profile)
     pressure, coverage = strongest([dome], X, Y, STEP_M)
-    assert pressure.max() == pytest.approx(150.0, rel=1e-3)
-    assert (pressure * coverage).sum() / coverage.sum() == pytest.approx(100.0, rel=0.02)
+    assert pressure.max() == pytest.approx(150.0, rel=off_middle)
+    assert (pressure * coverage).sum() / coverage.sum() == pytest.approx(mean_kpa, rel=0.02)
     along, across = (
         dome.pressure_at(np.array(0.01 + r * np.cos(t)), np.array(-0.005 + r * np.sin(t)))
         for r, t in ((0.016, 0.7), (0.0096, 0.7 + np.pi / 2))
     )
-    assert along == pytest.approx(150.0 * 0.6)  # at 0.8 of both half axes
+    assert along == pytest.approx(150.0 * left)  # at 0.8 of both half axes
     assert across == pytest.approx(along)
 
 
