@@ -143,16 +143,16 @@ class PressureCurve:
         +inf where the bound of the magnitude lies beyond the curve's top, NaN where it is unknown.
         """
         most = magnitude + ONE_SIDED_95 * sigma
-        reported = self.pressure(magnitude)
-        kpa = reported + np.hypot(self.pressure(most) - reported, ONE_SIDED_95 * self.sigma(most))
+        reported, highest = self.pressure(np.array([magnitude, most]))
+        kpa = reported + np.hypot(highest - reported, ONE_SIDED_95 * self.sigma(most))
         return np.where(most > self.magnitude[-1], np.inf, kpa)
 
     def least(self, magnitude: FloatArray, sigma: FloatArray) -> FloatArray:
         """Pressure in kPa, same shape, that the true one exceeds with 95 %; at most the top."""
         least = np.maximum(magnitude - ONE_SIDED_95 * sigma, 0.0)
-        reported = self.pressure(magnitude)
-        by_both = np.hypot(reported - self.pressure(least), ONE_SIDED_95 * self.sigma(least))
-        return np.maximum(reported - by_both, 0.0)
+        reported, lowest = self.pressure(np.array([magnitude, least]))
+        by_both = np.hypot(reported - lowest, ONE_SIDED_95 * self.sigma(least))
+        return np.asarray(np.maximum(reported - by_both, 0.0))
 
     def range_of(
         self,

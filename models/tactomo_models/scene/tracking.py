@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from math import dist
 from typing import NamedTuple
 
 import numpy as np
@@ -49,11 +50,10 @@ class _Track:
             self.before.append(seen)
         self.last, self.missed = seen, 0
 
-    def distances_m(self, centres_m: FloatArray) -> FloatArray:
+    def distances_m(self, centres_m: FloatArray) -> list[float]:
         """How far contacts (K, 2) are from where it is, or was before it grew: the nearer."""
         places = [self.last.centre_m, *(seen.centre_m for seen in self.before if self.grown)]
-        apart = np.linalg.norm(np.array(places)[:, None] - centres_m, axis=2)
-        return np.asarray(apart.min(axis=0))
+        return [min(dist(place, centre_m) for place in places) for centre_m in centres_m]
 
 
 class ContactTracker:
