@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from tactomo_protocol import Channel
 
-from tactomo_models.arrays import BoolArray, FloatArray
+from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.compiled_sheet import CompiledData
 from tactomo_models.scans.frame_noise import CERTAIN
 from tactomo_models.scans.plausibility import Flag
@@ -72,13 +72,13 @@ class Changes:
     def judged_by(self, error_ratio: float) -> Changes:
         """The same for a found sheet, whose errors have so many times the even one's variance."""
         there = self.weight > 0
-        variance = np.divide(1, self.weight**2, out=np.ones_like(self.weight), where=there)
+        variance = 1 / np.where(there, self.weight, 1.0) ** 2
         error = error_ratio * np.maximum(variance - self.noise_variance, 0.0)
         variance = self.noise_variance + error
         return replace(
             self,
             weight=there / np.sqrt(variance),
-            variance_inflation=inflated(error / variance, there),
+            variance_inflation=inflated(error / variance, int(np.count_nonzero(there))),
             tolerance=error_ratio * self.tolerance,
         )
 
@@ -118,7 +118,7 @@ class Changes:
         return float(np.sqrt((self.weighted(self.change) ** 2).sum() / count))
 
 
-def inflated(error_share: FloatArray, valid: BoolArray) -> FloatArray:
+def inflated(error_share: FloatArray, count: int) -> FloatArray:
     """Factor (M,) by which model errors that go together weigh more than independent ones.
 
     What is drawn a little wrong moves the voltages in few directions, however many electrodes look
@@ -126,9 +126,9 @@ def inflated(error_share: FloatArray, valid: BoolArray) -> FloatArray:
 
     Args:
         error_share: (M,) share of each variance that is of model errors.
-        valid: (M,) which voltages count.
+        count: voltages that are valid.
     """
-    together = max(np.count_nonzero(valid) / ERROR_DIRECTIONS, 1.0)
+    together = max(count / ERROR_DIRECTIONS, 1.0)
     return 1 + (together - 1) * error_share
 
 

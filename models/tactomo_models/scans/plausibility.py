@@ -186,11 +186,11 @@ class ScanCheck:
         usable = self._usable & (size <= self._limit)
         flags = Flag(0)
         wrong = usable ^ self._usable
-        if wrong.any():
-            flags |= Flag.INVALID_VOLTAGE
         if not usable.all():
             size = np.where(usable, size, 0.0)
             scan = np.where(usable, scan, 0.0)
+            if wrong.any():
+                flags |= Flag.INVALID_VOLTAGE
         clipped = self._clipped(size, saturated=saturated)
         if clipped is not None:
             flags |= Flag.SATURATED
@@ -201,9 +201,7 @@ class ScanCheck:
             flags |= Flag.NOISE_HIGH
         along = scan * self._sign
         outlier = unequal | (along < self._wrong_way * noise)
-        not_to_go_by = outlier | ~usable
-        if not_to_go_by.any():
-            along = np.where(not_to_go_by, self._size, along)
+        along = np.where(outlier | ~usable, self._size, along)  # what is not to go by
         silent = self._pairs @ along < self._silence
         if silent.any():
             outlier |= self._wiring.pairs[silent].any(axis=0)

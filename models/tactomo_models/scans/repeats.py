@@ -51,6 +51,7 @@ class Repeats:
         }
         self._names, self._parts = np.array(list(parts)), np.array(list(parts.values()))
         self._sizes = self._parts.sum(axis=1)
+        self._smallest = int(self._sizes.min())
         self._earlier: dict[Channel, FloatArray] = {}  # (n, M) scans of each, the last one last
 
     def forget(self) -> None:
@@ -80,7 +81,7 @@ class Repeats:
             is_another = bool(np.median(apart, axis=1).min() > 1.5 * last_bit)
             return Repeated((), np.ones(len(scan), bool), is_another)
         same = scan == earlier[-1]
-        if np.count_nonzero(same) < self._sizes.min():
+        if np.count_nonzero(same) < self._smallest:
             return Repeated((), np.zeros(len(scan), bool))
         whole = self._parts @ same.astype(int) == self._sizes
         others = same[~self._parts[whole].any(axis=0)]

@@ -237,8 +237,10 @@ class ChannelTare:
             shown = float((valid * unfollowed**2 / variance).sum()) + (0 if quiet else count)
             if shown >= noise_limit(count, freedom):
                 flags |= Flag.CREEPING
+        # Where the whole sheet changed against the sign of pressing, less presses than at the tare.
         total = self._total
-        if not (quiet or electrodes) and _fell(total * change, total**2 * variance):
+        least = -WRONG_WAY * (total**2 @ variance) ** 0.5
+        if not (quiet or electrodes) and total @ change < least:
             flags |= Flag.REFERENCE_MISMATCH
         common, beyond, hides = 1.0, np.inf, quiet and self._is_noisy
         if quiet and ratio > 1 and not hides:
@@ -248,12 +250,12 @@ class ChannelTare:
             common = median(over) or 1.0
             # A gain behind what makes the noise takes the noise along; one before leaves it.
             scale = max(abs(common), 1.0)
-            with np.errstate(over="ignore"):  # absurd volts are no factor
-                beyond = float(((over / scale - common / scale) ** 2 / variance[valid]).mean())
+            off = over / scale - common / scale
+            beyond = float((off**2 / variance[valid]).sum()) / count
         changes = Changes(
             change=change,
             weight=valid / np.sqrt(noise + error),
-            variance_inflation=inflated(error / (noise + error), valid),
+            variance_inflation=inflated(error / (noise + error), count),
             noise_variance=noise,
             tolerance=still_share * error,
             modes=self._modes,
@@ -397,7 +399,7 @@ class Tare:
         is_measured = self.reference.is_noise_measured and not self.reference.lacks_noise
         if magnitude is None or structure is None or not is_measured:
             return False
-        return np.array_equal(magnitude, structure)
+        return bool((magnitude == structure).all())
 
     def _are_swapped(self, changes: Mapping[Channel, Changes]) -> bool:
         """Tell whether the magnitude channel answers more than the structure channel.
@@ -436,14 +438,6 @@ def _leading_modes(
     whitened = jacobian / np.sqrt(variance)[:, None]
     squares, vectors = np.linalg.eigh(whitened @ whitened.T)
     return np.ascontiguousarray(vectors[:, squares > least**2 * squares[-1]])
-
-
-def _fell(total: FloatArray, variance: FloatArray) -> bool:
-    """Tell whether the sheet as a whole changed against the sign that pressing has.
-
-    Then less presses now than did at the tare.
-    """
-    return float(total.sum()) < -WRONG_WAY * float(np.sqrt(variance.sum()))
 
 
 def _mismatch(reference: FloatArray, predicted: FloatArray) -> float:
