@@ -13,6 +13,7 @@ import pytest
 from cpp_client import CPP_FOLDER, need_headers
 from needs import need
 from page import Page
+from tactomo.stream import keys as key_files
 from tactomo_client import Contact
 from tactomo_client.fake import FakeSensor
 from waiting import repeated
@@ -98,6 +99,18 @@ def test_from_nothing_to_a_running_controller(checkout: Checkout, pressed: str) 
     assert "7 at (10.0, -5.0) mm, 183 kPa\n" in said["robot"]
     by_pkg_config = checkout.run(f"robot/robot {pressed}")
     assert "7 at (10.0, -5.0) mm, 183 kPa\n" in by_pkg_config
+
+
+@pytest.mark.slow
+def test_the_controller_says_what_keys_are_wrong(
+    checkout: Checkout, pressed: str, tmp_path: Path
+) -> None:
+    checkout.run("cmake -S clients/cpp -B build && cmake --build build")
+    for name in ("desk", "robot"):
+        key_files.make_pair(tmp_path, name)
+    key_files.secret_path(tmp_path, "robot").unlink()
+    said = checkout.run(f"build/controller skin --seconds 3 --stream {pressed} --keys {tmp_path}")
+    assert "stop: not the server of that public key\n" in said
 
 
 HERE = "add_subdirectory({source} tactomo)"

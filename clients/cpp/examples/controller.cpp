@@ -67,7 +67,15 @@ struct Decision {
     std::string_view reason;
 };
 
-Decision decide(const tactomo::Frame* frame, bool& retreats) {
+Decision decide(const tactomo::Frame* frame, tactomo::Door door, bool& retreats) {
+    if (frame == nullptr || frame->is_stale()) {
+        switch (door) {
+            case tactomo::Door::open: break;
+            case tactomo::Door::key_refused: return {"stop", "key refused: `tactomo keys allow`"};
+            case tactomo::Door::keys_needed: return {"stop", "give keys: --keys FOLDER"};
+            case tactomo::Door::wrong_server: return {"stop", "not the server of that public key"};
+        }
+    }
     if (frame == nullptr) return {"stop", "no frame yet: what does `tactomo status` say?"};
     if (frame->is_stale()) return {"stop", "stale"};
     const tactomo::Answer hard = frame->exceeds(retreats ? calm_kpa : hard_kpa);
@@ -117,7 +125,7 @@ void run(const Settings& settings) {
         const tactomo::Frame* const frame = skin.latest();
         reading.add(std::chrono::steady_clock::now() - before);
 
-        const Decision decision = decide(frame, retreats);
+        const Decision decision = decide(frame, skin.door(), retreats);
         if (last != decision.reason) tell(decision);
         last = decision.reason;
     }
