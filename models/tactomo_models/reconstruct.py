@@ -12,6 +12,7 @@ counted in modelled work, so that a recording reconstructs exactly as the live s
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -205,7 +206,9 @@ class Reconstructor:
             self._measured(Channel.MAGNITUDE, magnitude),
             self._measured(Channel.STRUCTURE, structure),
         )
-        with self._blas.limit(limits=1):  # more threads wait for each other
+        # More threads wait for each other. The daemon keeps all to one, and to ask is faster.
+        is_one = all(library.num_threads == 1 for library in self._blas.lib_controllers)
+        with nullcontext() if is_one else self._blas.limit(limits=1):
             return self.solve(self.compare(*scans, saturated=saturated, companions=companions))
 
     def compare(
