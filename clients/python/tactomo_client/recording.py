@@ -183,7 +183,7 @@ def _files_in(folder: Path, sensor: str | None) -> tuple[Path, ...]:
     if not files:
         raise RecordingError(
             f"there are no recordings{f' of {sensor}' if sensor else ''} in the folder {folder}",
-            "give the daemon's folder of recordings, or the path of a .mcap file",
+            "give a folder of recordings that the daemon named, or the path of a .mcap file",
         )
     return tuple(files[number] for number in sorted(files))
 

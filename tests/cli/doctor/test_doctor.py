@@ -191,6 +191,14 @@ def test_what_a_recording_does_not_tell_is_said_of_a_recording(
     assert step in drift["next_step"]
 
 
+def test_frames_beyond_a_recording_are_the_problem(
+    tactomo: Run, paper: SensorDescription, rest: FloatArray
+) -> None:
+    record_board(paper, noisy(rest), range(40))
+    outcome = tactomo("doctor", "board.mcap", "--frames", "50:60", status=1)
+    assert "among these --frames" in outcome.stderr
+
+
 def record_board(paper: SensorDescription, volts: FloatArray, numbers: Sequence[int]) -> None:
     """Record a board that prints: when its scans came is all that is known of time."""
     both = (Channel.MAGNITUDE, Channel.STRUCTURE)

@@ -227,7 +227,8 @@ def of_recording(recording: Recording, description: str | None, frames: slice | 
             )
     if not scans:
         raise TactomoError(
-            f"there are no scans of {known.name} in {recording.path}",
+            f"there are no scans of {known.name} in {recording.path}"
+            + (" among these --frames" if frames else ""),
             "`tactomo info` shows what is in it; it may need another --description",
         )
     evidence = Evidence(str(recording.path), known, scans)
