@@ -70,7 +70,8 @@ def describe(
         electrode_mm: length of an electrode, where the file has points or another length.
 
     Raises:
-        DataError: the file's electrodes are points, and no length is given.
+        DataError: the file's electrodes are points, and no length is given; or the outline
+            encloses nothing.
         DescriptionError: there can be no such sensor; says what to change.
     """
     lengths_mm = model.sizes * model.unit_mm
@@ -84,6 +85,11 @@ def describe(
     origin = np.array([low_x + high_x, low_y + high_y]) / 2
     moved = shapely.transform(model.polygon, lambda points: scale * (points - origin))
     polygon, spare_mm = _simplified(moved)
+    if not polygon.area:
+        raise DataError(
+            f"{source}: its outline crosses itself or encloses nothing; draw it in the order in "
+            "which one walks round the sheet"
+        )
     corners = [_listed(ring.coords[:-1]) for ring in (polygon.exterior, *polygon.interiors)]
     offset = (np.min(corners[0], axis=0) + np.max(corners[0], axis=0)) / 2  # of rounding
     corners = [_listed(np.array(each) - offset) for each in corners]
