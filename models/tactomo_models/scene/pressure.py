@@ -12,13 +12,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum, auto
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.scene.parameters import FALLING_SHARE
 from tactomo_models.sensor.description import SensorDescription
-from tactomo_models.sensor.response import MagnitudeResponse
 
 CLEARLY = 2.0  # standard uncertainties above zero from which a magnitude is one
 # Standard uncertainties by which a contact's last range is favoured. Noise then changes the range
@@ -79,6 +79,18 @@ class FieldContacts:
     total_force_sigma_n: float
 
 
+class Response(Protocol):
+    """A table of pressures and changes, of a sensor description or of a running daemon."""
+
+    @property
+    def pressure_kpa(self) -> tuple[float, ...]:
+        """Pressures (n,), rising."""
+
+    @property
+    def relative_change(self) -> tuple[float, ...]:
+        """Relative changes of conductivity (n,) under them."""
+
+
 @dataclass(frozen=True)
 class PressureCurve:
     """Pressure against |relative conductivity change|, straight between knots."""
@@ -88,10 +100,10 @@ class PressureCurve:
     sigma_kpa: FloatArray  #: (n,) standard uncertainty of the curve itself; 0 where nobody has said
 
     @classmethod
-    def of_response(cls, response: MagnitudeResponse) -> PressureCurve:
-        """The curve of a sensor description's table."""
+    def of_response(cls, response: Response) -> PressureCurve:
+        """The curve of a table; a calibration's may begin above a change of 0."""
         size = np.abs(np.asarray(response.relative_change))
-        onset = int(np.flatnonzero(size > 0)[0]) - 1
+        onset = max(int(np.flatnonzero(size > 0)[0]) - 1, 0)
         rising = np.append(True, np.diff(size[onset:]) > 0)  # of one change, the least pressure
         kpa = np.asarray(response.pressure_kpa)[onset:][rising]
         return cls(size[onset:][rising], kpa, np.zeros(len(kpa)))

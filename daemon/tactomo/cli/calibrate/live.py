@@ -20,7 +20,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from tactomo_client import Frame, Status
 from tactomo_client.recording import open_recording
-from tactomo_client.schema import MagnitudeResponse as ResponseInForce
 from tactomo_models import CalibrationError, SensorDescription, load_description
 from tactomo_models.calibration import load_cell
 from tactomo_models.calibration.calibration_file import (
@@ -40,7 +39,7 @@ from tactomo_models.calibration.curve import (
 from tactomo_models.calibration.outliers import find_outliers
 from tactomo_models.foreign_file import open_regular
 from tactomo_models.scans.plausibility import DISTRUST
-from tactomo_models.sensor.response import MagnitudeResponse
+from tactomo_models.scene.pressure import PressureCurve, Response, described_curve
 
 from tactomo.cli.console import Console
 from tactomo.cli.files.recorded_frames import recorded_frames
@@ -117,11 +116,8 @@ def _subject(status: Status) -> Subject:
     )
 
 
-def suggestions_kpa(status: Status) -> list[float]:
+def suggestions_kpa(response: Response) -> list[float]:
     """Pressures to take, up and down again, by the response that the daemon has now."""
-    assert status.description is not None
-    response = status.description.magnitude_response
-    assert response is not None
     kpa, change = response.pressure_kpa, response.relative_change
     onset = max((p for p, c in zip(kpa, change, strict=True) if c == 0), default=kpa[0])
     up = [onset + share * (kpa[-1] - onset) for share in SHARES]
@@ -142,9 +138,11 @@ class _Session:
     ) -> None:
         self._view, self._console, self._log = view, console, log
         self._area_mm2 = area_mm2 or math.nan  # of the indenter; asked for first where unknown
-        self._suggested = suggestions_kpa(status)
         assert status.description is not None
-        self._response = status.description.magnitude_response
+        response = status.description.magnitude_response
+        assert response is not None
+        self._suggested = suggestions_kpa(response)
+        self._curve = PressureCurve.of_response(response)
         self.readings: list[Reading] = _read_log(log)
 
     def run(self) -> None:
@@ -282,7 +280,7 @@ class _Session:
             self._console.print(
                 "The other readings contradict this reading: undo drops it.", style="red"
             )
-        if doubt := _doubt_of_unit(self.readings, self._response, "the daemon"):
+        if doubt := _doubt_of_unit(self.readings, self._curve, "the daemon"):
             question = "is the load cell's reading in newtons, and the indenter's size right?"
             self._console.print(f"{doubt}: {question}", style="red")
         if fit is not None:
@@ -383,25 +381,18 @@ def fitted(
     disagree = (f"{line} disagrees with the others" for line in odd)
     for note in (*joined.notes, *disagree):
         say(note, err=True)
-    assert known.magnitude is not None
-    if doubt := _doubt_of_unit(joined.readings, known.magnitude.response, known.name):
+    curve = described_curve(known)
+    assert curve is not None
+    if doubt := _doubt_of_unit(joined.readings, curve, known.name):
         say(f"{doubt}: is the column pressure_kpa in kPa, or force_n in N?", err=True)
     return PressureCalibration.of_readings(subject, joined.readings), odd
 
 
-def _doubt_of_unit(
-    readings: Sequence[Reading],
-    response: MagnitudeResponse | ResponseInForce | None,
-    whose: str,
-) -> str:
-    """Say where pressures are so far from a response's that they may be of another unit."""
-    assert response is not None
-    magnitudes = np.abs(response.relative_change)
-    read = [each for each in readings if magnitudes[0] < each.magnitude < magnitudes[-1]]
-    shares = [
-        each.pressure_kpa / np.interp(each.magnitude, magnitudes, response.pressure_kpa)
-        for each in read
-    ]
+def _doubt_of_unit(readings: Sequence[Reading], curve: PressureCurve, whose: str) -> str:
+    """Say where pressures are so far from a curve's that they may be of another unit."""
+    low, high = curve.magnitude[[0, -1]]
+    read = [each for each in readings if low < each.magnitude < high]
+    shares = [each.pressure_kpa / float(curve.pressure(np.array(each.magnitude))) for each in read]
     share = statistics.median(shares) if shares else 1.0
     if 1 / OTHER_UNIT < share < OTHER_UNIT:
         return ""
