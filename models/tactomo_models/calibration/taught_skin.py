@@ -127,6 +127,11 @@ def load_of(contact: Contact) -> float:
     return load if load > 0 else float("nan")
 
 
+def are_forces(force_n: FloatArray) -> BoolArray:
+    """Which may be a press's newtons, same shape; NaN may, which is not known."""
+    return np.isnan(force_n) | ((force_n > 0) & (force_n < np.inf))
+
+
 def press_changes(
     measurement: Measurement, channels: Sequence[Channel]
 ) -> tuple[FloatArray, BoolArray]:

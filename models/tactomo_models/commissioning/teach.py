@@ -22,7 +22,7 @@ from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.batch import read_scans
 from tactomo_models.calibration.calibration_file import Subject
 from tactomo_models.calibration.press_regression import ForceRegression, PressRegression
-from tactomo_models.calibration.taught_skin import TaughtSkin, load_of, press_changes
+from tactomo_models.calibration.taught_skin import TaughtSkin, are_forces, load_of, press_changes
 from tactomo_models.errors import CalibrationError, DataError
 from tactomo_models.reconstruct import Reconstructor
 from tactomo_models.scans.reference import Reference
@@ -155,11 +155,10 @@ def _check_numbers(presses: KnownPresses, description: SensorDescription) -> Non
             f"all places are within {np.abs(xy_mm).max():.2g} mm of the middle: they seem to be "
             "metres; give millimetres"
         )
-    known = presses.force_n[~np.isnan(presses.force_n)]
-    if not ((known > 0) & np.isfinite(known)).all():
+    if not are_forces(presses.force_n).all():
         raise CalibrationError(
-            f"a force of {known.min():g} N presses nothing: give newtons, above 0 where the skin "
-            "is pressed, and NaN where the force is not known"
+            f"a force of {np.nanmin(presses.force_n):g} N presses nothing: give newtons, above 0 "
+            "where the skin is pressed, and NaN where the force is not known"
         )
     scans = np.hstack(list(presses.scans.values()))
     for k in range(1, len(scans)):

@@ -16,6 +16,7 @@ from tactomo_client.keys import as_keys
 from tactomo_models.archive import read_arrays, write_arrays
 from tactomo_models.arrays import FloatArray
 from tactomo_models.calibration.calibration_file import Subject
+from tactomo_models.calibration.taught_skin import are_forces
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.sensor.description import SensorDescription
 
@@ -128,7 +129,7 @@ class _Session:
         if not description.on_sheet(1e-3 * np.array(x_mm), 1e-3 * np.array(y_mm)):
             self._console.print(f"not taken: ({x_mm:g}, {y_mm:g}) mm is off the skin")
             return True
-        if not (np.isnan(force_n) or 0 < force_n < np.inf):
+        if not are_forces(np.array(force_n)):
             self._console.print(f"not taken: {force_n:g} N presses nothing")
             return True
         heard = self._heard(HOLD_S)
