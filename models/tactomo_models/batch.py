@@ -213,13 +213,14 @@ def companions_of(
                 )
         if f"{key}_reference" in arrays:
             rest = np.atleast_1d(arrays[f"{key}_reference"])
-            mean = float(checked(source, f"{key}_reference", rest, (None,)).mean())
-            if not np.isfinite(mean):
+            read = checked(source, f"{key}_reference", rest, (None,))
+            usable = [each for each in read if description.companion[name].may_read(each)]
+            if not usable:
                 raise DataError(
-                    f"{source}: {key}_reference holds no number; give readings with nothing on "
-                    "the skin, or leave it out for the description's offset"
+                    f"{source}: {key}_reference holds no number within its limits; give readings "
+                    "with nothing on the skin, or leave it out for the description's offset"
                 )
-            at_rest[name] = mean
+            at_rest[name] = float(np.mean(usable))
     return readings, at_rest
 
 

@@ -7,6 +7,7 @@ from a source without noise.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Final
 
 from tactomo_models import Reference, SensorDescription
@@ -71,18 +72,18 @@ class Companions:
         self._heard_us: dict[str, int] = {}
 
     def read(self, dual: DualScan) -> list[CompanionReading]:
-        """Return what the companions that were heard say of a dual scan."""
+        """Return what the companions that were heard within their limits say of a dual scan."""
         if not self._companions:
             return []
-        now_us, felt = dual.scans[0].device_us, dual.companions
-        known = self._companions
-        self._tell_lost(now_us, {k for k, one in felt.items() if known[k].may_read(one.value)})
+        now_us, known = dual.scans[0].device_us, self._companions
+        felt = {k: one for k, one in dual.companions.items() if known[k].may_read(one.value)}
+        self._tell_lost(now_us, felt.keys())
         return [
             CompanionReading(name, one.value, 1e-6 * now_us, 1e-6 * one.since_us)
             for name, one in felt.items()
         ]
 
-    def _tell_lost(self, now_us: int, usable: set[str]) -> None:
+    def _tell_lost(self, now_us: int, usable: Collection[str]) -> None:
         for name in self._companions:
             heard_us = self._heard_us.get(name, now_us)
             if name in usable or heard_us > now_us:  # a clock that went back begins anew

@@ -175,10 +175,15 @@ class Imaging:
 
         One that was taken while contacts were shown is disputed, and not kept for the next start;
         so is the next one, if contacts explain how it differs from the one before the dispute.
+        What a companion without a reading meanwhile read at rest before stays.
         Returns whether it is in force.
         """
-        reference = tare.reference
         known = None if is_asked or self.reference is not None else self._known()
+        earlier = self.rest or known
+        if earlier is not None and earlier.reference.companions:
+            felt = dict([*earlier.reference.companions, *(tare.reference.companions or ())])
+            tare = replace(tare, reference=replace(tare.reference, companions=tuple(felt.items())))
+        reference = tare.reference
         if known is not None:
             found = skin_at_start(self._reconstructor, known.reference, reference, known.age_s)
             if found is SkinAtStart.LOADED:

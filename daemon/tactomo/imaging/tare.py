@@ -118,7 +118,7 @@ class Taring:
             volts: (M,) of each channel that is there.
             lost: channels that are not to be expected.
             contacts: how many were shown in this frame.
-            companions: their readings.
+            companions: their readings, within their limits.
         """
         tare = self._tare
         needed = {channel for channel in self._channels if channel not in lost}
@@ -197,8 +197,7 @@ class _Scans:
     ) -> bool:
         """Take one dual scan; returns whether there are enough of every needed channel now."""
         for reading in companions:
-            if np.isfinite(reading.value):
-                self._readings.setdefault(reading.name, []).append(reading.value)
+            self._readings.setdefault(reading.name, []).append(reading.value)
         for channel, values in volts.items():
             self._volts.setdefault(channel, []).append(values)
         return all(len(self._volts.get(channel, ())) >= self._wanted for channel in needed)

@@ -265,3 +265,23 @@ def test_a_file_gives_readings_at_rest_and_of_each_frame(
     np.savez(source, **{**arrays, "companion_load_cell": np.zeros(3)})
     with pytest.raises(DataError, match="3 readings of 2 frames"):
         reconstruct_file(source, target, description=sensor)
+
+
+def test_readings_at_rest_beyond_the_limits_do_not_count(
+    tmp_path: Path, skin: Skin, scan: FloatArray
+) -> None:
+    cell = {"load_cell": {**CELL, "limits": [-100.0, 1000.0]}}
+    sensor = variant(load_description("graded_square"), companion=cell)
+    source, target = tmp_path / "in.npz", tmp_path / "out.npz"
+    arrays: dict[str, Any] = {
+        "magnitude": scan[None],
+        "magnitude_reference": skin.reference().magnitude,
+        "companion_load_cell": np.array([BALL_N / 2 + 11]),
+    }
+    np.savez(source, **arrays, companion_load_cell_reference=np.array([10.0, 12.0, 1e4]))
+    reconstruct_file(source, target, description=sensor)
+    with np.load(target) as out:
+        assert out["force_n"][0] == pytest.approx(BALL_N, rel=0.02)
+    np.savez(source, **arrays, companion_load_cell_reference=1e4)
+    with pytest.raises(DataError, match="no number within its limits; give readings"):
+        reconstruct_file(source, target, description=sensor)
