@@ -105,6 +105,7 @@ class FrameRecord:
     """Which of the recording's references was in force, from 1; None for none."""
     is_cold: bool = False
     """Whether what came before is unknown, so that the reconstruction starts anew with it."""
+    is_disputed: bool = False  # whether it was open what lay on the skin at the tare
     timing: Timing | None = None  # None where an older version recorded
     calibration: str | None = None
     """Of pressure, to be put in force just before it: the text of its file, empty for none."""

@@ -37,6 +37,7 @@ class InForce:
     method: str
     budget_ms: float | None  # of modelled work; None for the method's own
     calibration: str  # the text of the pressure calibration; empty for the description's curve
+    is_disputed: bool  # whether it is open what lay on the skin at the tare
 
 
 class FrameLog:
@@ -75,6 +76,7 @@ class FrameLog:
             tuple(scan.key for scan in dual.scans),
             in_force.method,
             in_force.budget_ms,
+            is_disputed=in_force.is_disputed,
             timing=timing,
             reference_number=recording.references or None,
             calibration_number=recording.calibrations,

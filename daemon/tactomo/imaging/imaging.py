@@ -142,7 +142,8 @@ class Imaging:
     @property
     def in_force(self) -> InForce:
         """What the next frame is made with."""
-        return InForce(self.rest, *self.method.effective, self.calibration.text)
+        is_disputed = self._doubt is not None
+        return InForce(self.rest, *self.method.effective, self.calibration.text, is_disputed)
 
     @property
     def reference(self) -> Reference | None:
@@ -378,6 +379,7 @@ class Imaging:
         if mark.is_cold:
             self._reconstructor.reset()
         self.calibration.obey(mark.calibration)
+        self._doubt = Doubt() if mark.is_disputed else None
         if mark.reference is not None and mark.reference is not self.reference:
             self._reconstructor.set_reference(mark.reference)
             self._note_reference(KnownSkin(mark.reference, wall_clock_ns()))

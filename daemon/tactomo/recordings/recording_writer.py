@@ -77,6 +77,7 @@ def pack_frame(mark: FrameRecord) -> bytes:
         "reference": mark.reference_number,
         "calibration": mark.calibration_number,
         "cold": mark.is_cold,
+        "disputed": mark.is_disputed,
         "timing": mark.timing,
     }
     packed: bytes = msgpack.packb(fields)

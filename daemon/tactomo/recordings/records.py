@@ -100,6 +100,7 @@ def read_frame(data: bytes) -> FrameRecord:
         None,
         mark.reference,
         mark.cold,
+        mark.disputed,
         timing,
         calibration_number=mark.calibration,
     )
@@ -112,6 +113,7 @@ class _FrameRecord(BaseModel):
     reference: StrictInt | None = None
     calibration: StrictInt = 0
     cold: StrictBool = False
+    disputed: StrictBool = False
     timing: tuple[StrictInt, StrictBool, StrictInt | None, StrictBool] | None = None
 
 

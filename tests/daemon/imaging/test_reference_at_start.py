@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -124,6 +125,27 @@ def test_tares_under_a_press_are_disputed_until_somebody_touches_beside_it_and_t
     b.daemon.stop()
     again = begin(volts(True))  # it is what the sensor was last known as
     again.listener.event("tared")
+
+
+def test_a_recording_knows_which_frames_were_disputed(
+    begin: Any, replay: Start, tmp_path: Path
+) -> None:
+    """A tare under a press makes it nothing: in its replay as live, that is not sure."""
+    b = begin(volts(False))
+    b.listener.event("tared")
+    b.step(volts=volts(True))
+    b.ask("record_start", path="disputed.mcap")
+    first = b.skin.counter + 1
+    tare(b, volts(True))
+    for is_held in (True, True, False, False):
+        b.step(volts=volts(is_held))
+    b.ask("record_stop")
+    live = {m["scan_counter"]: m for m in b.listener.of("map") if m["scan_counter"] >= first}
+    again = {m["scan_counter"]: m for m in replay(tmp_path / "disputed.mcap", real=True).of("map")}
+    assert {k: (m["flags"], m["contacts"] == []) for k, m in again.items()} == {
+        k: (m["flags"], m["contacts"] == []) for k, m in live.items()
+    }
+    assert not is_known(live[b.skin.counter - 2])
 
 
 def test_a_skin_that_has_warmed_since_is_tared_anew(begin: Any) -> None:
