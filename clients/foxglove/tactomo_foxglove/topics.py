@@ -182,6 +182,7 @@ def write_mcap(
         if count == 1 and description:
             topics.sheet(description, time_ns)
         topics.frame(frame, time_ns, age_s)
+        file.flush()  # the writer keeps to itself that a write has failed
     try:
         writer.close()
     except RuntimeError as error:  # so it says that an earlier write had failed

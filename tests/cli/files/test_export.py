@@ -165,6 +165,26 @@ def test_what_was_there_stays_where_writing_fails(tactomo: Run, grasp: Path) -> 
     assert len(list(grasp.parent.iterdir())) == 3
 
 
+def test_an_export_for_foxglove_ends_where_writing_first_fails(grasp: Path) -> None:
+    """It went on to the recording's end, with two lines of the writer for each frame."""
+    command = [
+        sys.executable,
+        "-m",
+        "tactomo.cli",
+        "export",
+        str(grasp),
+        f"{grasp.parent}/fox.mcap",
+    ]
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert "fox.mcap: File too large; make room" in result.stderr
+    assert result.stderr.count("error logging message") < 10  # of one frame
+
+
 def test_what_is_there_is_written_over_only_if_one_says_so(tactomo: Run, grasp: Path) -> None:
     for name in ("contacts.csv", "layout.json"):
         grasp.with_name(name).write_text("precious")
