@@ -148,6 +148,19 @@ def test_a_folder_is_read_in_the_order_in_which_it_was_made(tmp_path: Path) -> N
     assert numbers_of(recording.frames(start_s=0.975)) == list(range(21, 31))
 
 
+def test_a_file_of_bytes_alone_beside_others_is_told(tmp_path: Path) -> None:
+    """One `record start` with --maps, and one without, in the daemon's folder."""
+    record(tmp_path / "left-000001-20260131T120000Z.mcap", range(1, 11))
+    record(tmp_path / "left-000002-20260131T120000Z.mcap", range(11, 21), maps=False)
+    recording = open_recording(tmp_path)
+    says = r"there are no maps and no contacts in .*left-000002-.*tactomo replay .*left-000002-"
+    with pytest.warns(RecordingWarning, match=says):
+        assert numbers_of(recording) == list(range(1, 11))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert numbers_of(recording.frames(end_s=0.3)) == list(range(1, 7))
+
+
 @pytest.mark.filterwarnings("error")
 def test_a_cut_recording_gives_what_there_is_and_says_so(tmp_path: Path) -> None:
     path = record(tmp_path / "cut.mcap", finish=False)

@@ -111,7 +111,7 @@ class Recording:
 
         Their `Frame.age_s` is the age at which they were published, and `Frame.is_stale` goes by
         that, not by the time now. Where a file is cut off or damaged, the frames beyond follow if
-        they are intact, and there is a RecordingWarning.
+        they are intact, and there is a RecordingWarning; likewise for a folder's file without any.
 
         Args:
             kind: ``map`` for images and contacts; ``contacts`` for contacts alone, which is faster.
@@ -139,7 +139,7 @@ class Recording:
         if end_s < start_s:
             raise ValueError(f"end_s = {end_s!r} is before start_s = {start_s!r}: give a later one")
         if not self.has_frames:
-            raise self._no_frames()
+            raise _no_frames(self.path, self.files[0])
         start_ns = self.start_ns + _nanoseconds(start_s)
         end_ns = self.start_ns + _nanoseconds(end_s)
         return self._frames(kind, start_ns, end_ns, stale_after_s)
@@ -147,7 +147,9 @@ class Recording:
     def _frames(
         self, kind: str, start_ns: int, end_ns: int, stale_after_s: float
     ) -> Iterator[Frame]:
-        for path in self.files:
+        for path, span in zip(self.files, self._spans, strict=True):
+            if start_ns <= span.end_ns and span.start_ns < end_ns and not _has_frames(path):
+                _warn(str(_no_frames(path, path)))
             for message in messages(path, kind, start_ns, end_ns, _warn):
                 try:
                     decoded = decode_message(message.data)
@@ -159,13 +161,14 @@ class Recording:
     def _spans(self) -> list[Span]:
         return [read_span(path) for path in self.files]
 
-    def _no_frames(self) -> RecordingError:
-        return RecordingError(
-            f"there are no maps and no contacts in {self.path}, only what the ports said",
-            f"record them, too (`tactomo record --maps`), or make them of it: "
-            f"`tactomo replay {self.files[0]} --speed max --record FRAMES.mcap`",
-            "no_frames",
-        )
+
+def _no_frames(path: Path, file: Path) -> RecordingError:
+    return RecordingError(
+        f"there are no maps and no contacts in {path}, only what the ports said",
+        f"record them, too (`tactomo record --maps`), or make them of it: "
+        f"`tactomo replay {file} --speed max --record FRAMES.mcap`",
+        "no_frames",
+    )
 
 
 def _files_in(folder: Path, sensor: str | None) -> tuple[Path, ...]:
@@ -176,7 +179,7 @@ def _files_in(folder: Path, sensor: str | None) -> tuple[Path, ...]:
     if sensor is None and len(sensors) > 1:
         raise RecordingError(
             f"{folder} holds recordings of several sensors: {', '.join(sensors)}",
-            f"say which: sensor={sensors[0]!r}",
+            f"say which: sensor={sensors[0]!r}; for a command, move each into its own folder",
         )
     wanted = sensor or next(iter(sensors), None)
     files = {int(match["number"]): path for match, path in named if match["sensor"] == wanted}
