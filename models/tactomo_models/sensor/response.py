@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Annotated, Self
+from typing import Annotated, Final, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -14,6 +14,7 @@ from tactomo_models.sensor.section import Section
 # TOML has lists where a frozen model has tuples; what is in them is as strict as the rest.
 ROWS = Field(min_length=2, max_length=64, strict=False)
 Table = Annotated[tuple[float, ...], ROWS]
+LARGEST_KPA: Final = 1e4  # 100 bar: beyond what presses on any skin
 
 
 class MagnitudeResponse(Section):
@@ -59,6 +60,11 @@ def _check_table(x: Table, y: Table, name: str, start: float) -> None:
         raise ValueError(f"{name} = {list(y)}: must have as many entries as pressure_kpa, {len(x)}")
     if x[0] != 0 or any(b <= a for a, b in pairwise(x)):
         raise ValueError(f"pressure_kpa = {list(x)}: must start at 0 and rise")
+    if x[-1] > LARGEST_KPA:
+        raise ValueError(
+            f"pressure_kpa = {list(x)}: must not exceed {LARGEST_KPA:g}; in pascals? {x[-1]:g} Pa "
+            f"are {1e-3 * x[-1]:g} kPa"
+        )
     steps = np.diff(y)
     if y[0] != start or not (np.all(steps >= 0) or np.all(steps <= 0)) or y[-1] == y[0]:
         raise ValueError(f"{name} = {list(y)}: must start at {start:g} and only rise or only fall")

@@ -39,6 +39,7 @@ def structure_table(ratios: str) -> str:
         ),
         (("[0.0, 100.0, 200.0]", "[0.0, 200.0, 100.0]"), ["pressure_kpa", "200.0, 100.0", "rise"]),
         (("[0.0, 100.0, 200.0]", "[1.0, 100.0, 200.0]"), ["pressure_kpa", "start at 0"]),
+        (("[0.0, 100.0, 200.0]", "[0.0, 1e5, 2e5]"), ["in pascals? 200000 Pa are 200 kPa"]),
         (("0.0, 0.0, 0.25]", "0.0, 0.0, 0.0]"), ["relative_change", "only rise"]),
         (("[magnitude.response]", "[magnitude.reponse]"), ["unknown key magnitude.reponse"]),
         (("conductivity_ratio = 100.0", ""), ["structure.response or conductivity_ratio"]),
