@@ -291,6 +291,11 @@ class Daemon:
         self._stop_asked.set()
         self._undo.close()
 
+    @property
+    def recording_failure(self) -> str:
+        """Why the last recording did not go on; empty where it did."""
+        return self._recorder.failure
+
     def wait(self) -> int:
         """Wait until the daemon is to stop, and return the exit status that it deserves."""
         supervision = Supervision(self._turns, self._status.summary)

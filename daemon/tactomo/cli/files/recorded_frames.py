@@ -208,6 +208,11 @@ def _reconstruct_file(path: Path, sensor: str, known: SensorDescription, target:
                 daemon.stop()
     if status != 0:
         raise TactomoError(f"{path} could not be replayed", "`tactomo replay` tells more")
+    if daemon.recording_failure:
+        raise TactomoError(
+            f"cannot reconstruct {path}: {daemon.recording_failure}",
+            "make room for its maps, or name a file where there is more",
+        )
 
 
 CLOCK_STEP_S: Final = 0.1
