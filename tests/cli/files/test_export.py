@@ -284,18 +284,25 @@ def test_half_a_reconstruction_is_no_export(tactomo: Run, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_a_reconstruction_that_the_disk_has_no_room_for_is_no_export(
-    tactomo: Run, tmp_path: Path
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("export bare.mcap made.csv", "cannot reconstruct bare.mcap"),
+        ("replay bare.mcap --speed max --record made.mcap", "made.mcap ended early"),
+    ],
+)
+def test_a_reconstruction_that_the_disk_has_no_room_for_is_no_good_end(
+    tactomo: Run, tmp_path: Path, command: str, said: str
 ) -> None:
     """The frames up to there were exported as if they were all."""
     bare_recording(tactomo, tmp_path, scans_pressed=60)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, before[1]))
     try:
-        result = tactomo("export", "bare.mcap", "made.csv", status=1)
+        result = tactomo(*command.split(), status=1)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert "cannot reconstruct bare.mcap" in result.stderr
+    assert said in result.stderr
     assert "File too large" in result.stderr
     assert "make room" in result.stderr
     assert not (tmp_path / "made.csv").exists()

@@ -10,6 +10,7 @@ import typer
 
 from tactomo.cli import options
 from tactomo.cli.output import say
+from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
     from tactomo_models import SensorDescription
@@ -229,7 +230,13 @@ def _run_daemon(
     daemon = Daemon(settings, description=description)
     if daemon.playback is not None:
         begin_replay(daemon.playback)
-    return daemon.run()
+    status = daemon.run()
+    if settings.exit_at_end and daemon.recording_failure:
+        raise TactomoError(
+            f"{settings.recording.file} ended early: {daemon.recording_failure}",
+            "make room for the maps, or name a file where there is more",
+        )
+    return status
 
 
 def _run_skins(skins: tuple[DaemonConfig, ...]) -> int:
