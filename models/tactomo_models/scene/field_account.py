@@ -191,7 +191,8 @@ class FieldAccountant:
             return images
         variances, axes = np.linalg.eigh(covariance)
         half = np.random.default_rng(0).standard_normal((DRAWS // 2, len(parameters)))
-        off = half * np.sqrt(np.maximum(variances, 0.0)) @ axes.T
+        # The symmetric root: it goes with the covariance evenly, so that images do not flicker.
+        off = half @ (axes * np.sqrt(np.maximum(variances, 0.0))) @ axes.T
         light, mean = family.light(parameters), np.zeros_like(images)
         for each in parameters + np.vstack([off, -off]):
             possible = family.as_light(family.bounded(each), light)
