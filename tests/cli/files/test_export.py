@@ -9,6 +9,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,17 @@ from waiting import wait_until
 @pytest.fixture
 def grasp(tmp_path: Path) -> Path:
     return write_grasp(tmp_path / "grasp.mcap")
+
+
+@contextmanager
+def files_up_to(size_bytes: int) -> Iterator[None]:
+    """No file may be longer, as on a full disk, of whatever program begins in here."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -153,12 +166,8 @@ def test_what_goes_wrong_is_told(
 def test_what_was_there_stays_where_writing_fails(tactomo: Run, grasp: Path) -> None:
     for name in ("contacts.csv", "fox.mcap"):
         grasp.with_name(name).write_text("precious")
-        before = resource.getrlimit(resource.RLIMIT_FSIZE)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
-        try:
+        with files_up_to(4096):
             result = tactomo("export", grasp, name, "--force")
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, before)
         assert result.returncode == 1, name
         assert f"cannot write {name}" in result.stderr
         assert grasp.with_name(name).read_text() == "precious"
@@ -175,12 +184,8 @@ def test_an_export_for_foxglove_ends_where_writing_first_fails(grasp: Path) -> N
         str(grasp),
         f"{grasp.parent}/fox.mcap",
     ]
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
-    try:
+    with files_up_to(0):
         result = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert "fox.mcap: File too large; make room" in result.stderr
     assert result.stderr.count("error logging message") < 10  # of one frame
 
@@ -296,12 +301,8 @@ def test_a_reconstruction_that_the_disk_has_no_room_for_is_no_good_end(
 ) -> None:
     """The frames up to there were exported as if they were all."""
     bare_recording(tactomo, tmp_path, scans_pressed=60)
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, before[1]))
-    try:
+    with files_up_to(40_000):
         result = tactomo(*command.split(), status=1)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert said in result.stderr
     assert "File too large" in result.stderr
     assert "make room" in result.stderr
